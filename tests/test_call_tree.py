@@ -49,10 +49,10 @@ def step_of(width, method, boundary):
 @pytest.mark.parametrize(
     ("method", "boundary", "width", "files", "functions"),
     [
-        pytest.param(mpm.Explicit(), (), 0.55, 21, 87, id="explicit free"),
-        pytest.param(mpm.SemiImplicit(), mpm.SlipBox((0.0, 0.0), (0.8, 0.8)), 0.65, 34, 191, id="semi-implicit slip"),
+        pytest.param(mpm.Explicit(), (), 0.55, 21, 81, id="explicit free"),
+        pytest.param(mpm.SemiImplicit(), mpm.SlipBox((0.0, 0.0), (0.8, 0.8)), 0.65, 33, 171, id="semi-implicit slip"),
         pytest.param(
-            mpm.SemiImplicit(), mpm.SeparatingBox((0.0, 0.0), (0.8, 0.8)), 0.75, 39, 259, id="semi-implicit separating"
+            mpm.SemiImplicit(), mpm.SeparatingBox((0.0, 0.0), (0.8, 0.8)), 0.75, 39, 241, id="semi-implicit separating"
         ),
     ],
 )

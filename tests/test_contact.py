@@ -404,10 +404,10 @@ def test_an_active_set_that_does_not_settle_is_given_up_after_four_sweeps():
     nodes = in_touch(FLOORS["mirrored"](0.0))
     pulled = eqx.tree_at(lambda n: n.v, nodes, jnp.ones_like(nodes.velocity))
     new = update(pulled, Stubborn())
-    assert new.contact.info.sweeps == SWEEPS == 4
+    assert new.contact.sweeps == SWEEPS == 4
     (contact,) = nodes.contacts
     columns = contact.image.along(contact.before == 0) & (nodes.mass > 0)
-    assert int(new.contact.info.violations) == int(columns.sum()) > 3
+    assert int(new.contact.violations) == int(columns.sum()) > 3
 
 
 @pytest.mark.thorough

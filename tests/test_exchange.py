@@ -104,7 +104,7 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
             return cross(place, np.asarray(impulse)).sum(axis=0)
 
         pivots = np.stack([np.asarray(m.centre) + np.asarray(m.at((n + late) * dt)) for m in motions])
-        rubbed = () if new.contact is None else step.held.pushes(new.contact.friction)
+        rubbed = () if new.contact is None else step.held.pushes(new.friction)
         turning = [n for n, one in enumerate(scene.boundary) if one.collider_count]
         rub = sum(np.asarray(given) for number, given in rubbed if number in turning)  # by springs and friction
         holding = np.asarray(step.holding)

@@ -306,8 +306,8 @@ def _step_budget(
     weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
     body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
     held, free = reaction(nodes, new.solved, new.elastic), nodes.projection
-    if new.contact is not None:
-        free = Projection(*new.contact.held.beyond_boundaries())
+    if new.constrained is not None:
+        free = Projection(*new.constrained.beyond_boundaries())
     boundary, missed = free.combine(0, held), free.combine(held, 0)
 
     # viscosity: its impulse, and what it dissipates of the velocity that it resists

@@ -36,6 +36,7 @@ class AbstractCollider(AbstractBoundary):
     collider_count: ClassVar[int] = 1
 
     def __check_init__(self):
+        require_fields(self)
         motion, d = self.motion, self.dim
         require(
             motion is None or motion.dim == d,
@@ -120,9 +121,6 @@ class StickyCollider(AbstractCollider):
     motion: AbstractMotion | None = None
     meets_rigid_bodies: ClassVar[bool] = False
 
-    def __check_init__(self):
-        require_fields(self)
-
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = v_c."""
         nothing, place, velocity = self.seen_by(nodes, t, dt, reference)
@@ -146,9 +144,6 @@ class SlipCollider(AbstractCollider):
     shape: AbstractRegion
     motion: AbstractMotion | None = None
     meets_rigid_bodies: ClassVar[bool] = False
-
-    def __check_init__(self):
-        require_fields(self)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """In the total description its normal must be the same everywhere and always."""

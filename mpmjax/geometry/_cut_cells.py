@@ -234,7 +234,11 @@ def _cut(corners: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
     simplices, directions = [np.zeros((0, d, d))], [np.zeros((0, d))]
     for count in range(1, d + 1):
         rows = np.flatnonzero(within == count)
-        for piece in _pieces(d, range(count), range(count, d + 1)):
+        pieces = [list(itertools.product(range(count), range(count, d + 1)))]  # corners, by the ends of their edges
+        if len(pieces[0]) > d:  # two corners inside and two outside, in 3-D
+            first, second, third, fourth = pieces[0]
+            pieces = [[first, second, fourth], [first, fourth, third]]
+        for piece in pieces:
             vertices = _crossings(corners[rows], values[rows], piece)
             area = _area(vertices)
             simplices.append(vertices)
@@ -278,16 +282,6 @@ def _crossings(corners: np.ndarray, values: np.ndarray, edges: list[tuple[int, i
         return corners[:, i] if i == j else corners[:, i] + a / (a - b) * (corners[:, j] - corners[:, i])
 
     return np.stack([crossing(i, j) for i, j in edges], axis=1)
-
-
-def _pieces(d: int, inner: range, outer: range) -> list[list[tuple[int, int]]]:
-    """The flat pieces of d corners each into which the surface of a simplex is divided, a corner given by the ends of
-    the edge on which it lies."""
-    edges = list(itertools.product(inner, outer))
-    if len(edges) == d:
-        return [edges]
-    first, second, third, fourth = edges  # two corners inside and two outside, in 3-D
-    return [[first, second, fourth], [first, fourth, third]]
 
 
 def _area(corners: np.ndarray) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Prescribed motions. They are data, not callables, so that they can be saved, differentiated and changed without
 compiling anew."""
 
-import abc
 from functools import partial
 from typing import Any, ClassVar
 
@@ -48,25 +47,27 @@ class AbstractMotion(eqx.Module):
         """The change of the displacement from t to t + dt [m], shape (d,)."""
         return _change(t, dt, jnp.asarray(self.times), jnp.asarray(self.displacement))
 
-    @abc.abstractmethod
     def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
-        """The positions X before the motion of the points that are at x at time t [m], both (m, d)."""
+        """The positions X before the motion of the points that are at x at time t [m], both (m, d). Default: x − d(t),
+        as the rest of a translation by the displacement."""
+        return x - self.at(t)
 
-    @abc.abstractmethod
     def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """The positions x at time t of the points X [m], both (m, d)."""
+        return X + self.at(t)
 
-    @abc.abstractmethod
     def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """The vectors a, fixed in the body, as turned by it at time t, both (m, d)."""
+        del t
+        return a
 
-    @abc.abstractmethod
     def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
         """Mean velocity of the points X from t to t + dt [m/s], shape (m, d): (place(t + dt) − place(t))/dt."""
+        return jnp.broadcast_to(self.shift(t, dt) / dt, X.shape)
 
-    @abc.abstractmethod
     def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         """The point for torques at time t [m], shape (d,), of a body with the given middle [m], shape (d,)."""
+        return middle + self.at(t)
 
 
 class Motion(AbstractMotion):
@@ -95,24 +96,6 @@ class Motion(AbstractMotion):
     def velocity(self, t: Scalar, dt: Scalar) -> Float[Array, "d"]:
         """Mean velocity from t to t + dt [m/s], shape (d,). A node with it follows the displacement exactly."""
         return self.shift(t, dt) / dt
-
-    def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
-        """x − d(t)."""
-        return x - self.at(t)
-
-    def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
-        """X + d(t)."""
-        return X + self.at(t)
-
-    def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
-        del t
-        return a
-
-    def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
-        return jnp.broadcast_to(self.velocity(t, dt), X.shape)
-
-    def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        return middle + self.at(t)
 
 
 class RigidMotion(AbstractMotion):
@@ -156,8 +139,7 @@ class RigidMotion(AbstractMotion):
         return _interpolated(t, jnp.asarray(self.times), self._rotations())
 
     def _rotations(self) -> Float[Array, "j r"]:
-        rotation = jnp.asarray(self.rotation)
-        return rotation.reshape(len(rotation), -1)
+        return jnp.asarray(self.rotation).reshape(len(self.times), -1)
 
     def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """c + Rᵀ (x − c − d)."""

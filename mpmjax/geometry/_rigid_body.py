@@ -103,7 +103,12 @@ def rotation_of(body: RigidBody, momentum: Float[Array, "r"], dt: Scalar) -> Flo
 
     def missing(mean: Array) -> Array:
         spin = inverse @ mean
-        return mean - momentum - _stretched(dt, spin) / 2 * jnp.cross(mean, spin)
+        square = (dt / 2) ** 2 * (spin**2).sum()
+        small = square < 1e-3  # where τ/Δt is its series, to the last digit
+        half = jnp.sqrt(jnp.where(small, 1, square))
+        series = 1 + square / 3 + 2 * square**2 / 15 + 17 * square**3 / 315 + 62 * square**4 / 2835
+        tau = dt * jnp.where(small, series, jnp.tan(half) / half)
+        return mean - momentum - tau / 2 * jnp.cross(mean, spin)
 
     mean = momentum
     for _ in range(_NEWTON):
@@ -142,12 +147,3 @@ def rotation_of_chords(
     for _ in range(_NEWTON):
         rotation = rotation - jnp.linalg.solve(jax.jacfwd(missing)(rotation), missing(rotation))
     return rotation
-
-
-def _stretched(dt: Scalar, spin: Array) -> Array:
-    """τ = Δt tan(h)/h [s] with h = ½ Δt ‖ω‖."""
-    square = (dt / 2) ** 2 * (spin**2).sum()
-    small = square < 1e-3  # where it is its series, to the last digit
-    half = jnp.sqrt(jnp.where(small, 1, square))
-    series = 1 + square / 3 + 2 * square**2 / 15 + 17 * square**3 / 315 + 62 * square**4 / 2835
-    return dt * jnp.where(small, series, jnp.tan(half) / half)

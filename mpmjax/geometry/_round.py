@@ -2,6 +2,7 @@
 
 import itertools
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -93,7 +94,31 @@ class Annulus(AbstractRegion):
         return _polar_cells(self.centre, self.inner, self.outer, size)
 
 
-class Capsule(AbstractRegion):
+class AbstractRound(AbstractRegion):
+    """A region about the segment between two points."""
+
+    start: eqx.AbstractVar[Point]
+    end: eqx.AbstractVar[Point]
+
+    def __check_init__(self):
+        name, start, end = f"A {type(self).__name__.lower()}", self.start, self.end
+        require(
+            coordinates(f"{name}'s start", start) == coordinates(f"{name}'s end", end),
+            f"{name} needs two ends with as many coordinates, got {start} and {end}.",
+        )
+        require_finite(f"{name}'s start", start)
+        require_finite(f"{name}'s end", end)
+        require_that(f"{name}'s ends must differ", lambda a, b: (a != b).any(), start, end)
+
+    @property
+    def dim(self) -> int:
+        return len(self.start)
+
+    def middle(self) -> Float[Array, "d"]:
+        return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
+
+
+class Capsule(AbstractRound):
     """The points within a radius of a segment.
 
     Args:
@@ -108,12 +133,7 @@ class Capsule(AbstractRegion):
 
     def __check_init__(self):
         require_fields(self)
-        _check_segment("A capsule", self.start, self.end)
         require_positive("A capsule's radius", self.radius)
-
-    @property
-    def dim(self) -> int:
-        return len(self.start)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """‖x − nearest point of the segment‖ − radius."""
@@ -126,11 +146,8 @@ class Capsule(AbstractRegion):
         ends, radius = np.stack([np.asarray(self.start, float), np.asarray(self.end, float)]), float(self.radius)
         return ends.min(axis=0) - radius, ends.max(axis=0) + radius
 
-    def middle(self) -> Float[Array, "d"]:
-        return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
 
-
-class Cylinder(AbstractRegion):
+class Cylinder(AbstractRound):
     """A round cylinder with flat ends (in 2-D a rectangle, with an axis in any direction).
 
     Args:
@@ -145,13 +162,8 @@ class Cylinder(AbstractRegion):
 
     def __check_init__(self):
         require_fields(self)
-        _check_segment("A cylinder", self.start, self.end)
         require(len(self.start) > 1, f"A cylinder has two or three coordinates, got {self.start}: take a Box.")
         require_positive("A cylinder's radius", self.radius)
-
-    @property
-    def dim(self) -> int:
-        return len(self.start)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """As for a box, from the distances to the ends and to the lateral surface."""
@@ -168,9 +180,6 @@ class Cylinder(AbstractRegion):
         reach = float(self.radius) * np.sqrt(np.maximum(1 - axis**2, 0))
         return ends.min(axis=0) - reach, ends.max(axis=0) + reach
 
-    def middle(self) -> Float[Array, "d"]:
-        return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
-
     def fitted(self, size: np.ndarray) -> Cells:
         """Sectors of concentric rings, in slices along the axis; in 2-D the cells of the rectangle, along the axis and
         across."""
@@ -183,7 +192,7 @@ class Cylinder(AbstractRegion):
         return start + cells @ np.stack([along, across]), areas
 
 
-class Tube(AbstractRegion):
+class Tube(AbstractRound):
     """The wall of a round tube with flat ends, in 3-D.
 
     Args:
@@ -200,13 +209,8 @@ class Tube(AbstractRegion):
 
     def __check_init__(self):
         require_fields(self)
-        _check_segment("A tube", self.start, self.end)
         require(len(self.start) == 3, f"A tube has three coordinates, got {self.start}: take an Annulus in 2-D.")
         _check_radii("A tube", self.inner, self.outer)
-
-    @property
-    def dim(self) -> int:
-        return 3
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """As for a cylinder, with the distance to the nearer of the two lateral surfaces."""
@@ -221,22 +225,9 @@ class Tube(AbstractRegion):
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         return Cylinder(self.start, self.end, self.outer).bounds()
 
-    def middle(self) -> Float[Array, "d"]:
-        return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
-
     def fitted(self, size: np.ndarray) -> Cells:
         """Sectors of concentric rings, in slices along the axis."""
         return _round_cells(self.start, self.end, self.inner, self.outer, size)
-
-
-def _check_segment(name: str, start: Point, end: Point) -> None:
-    require(
-        coordinates(f"{name}'s start", start) == coordinates(f"{name}'s end", end),
-        f"{name} needs two ends with as many coordinates, got {start} and {end}.",
-    )
-    require_finite(f"{name}'s start", start)
-    require_finite(f"{name}'s end", end)
-    require_that(f"{name}'s ends must differ", lambda a, b: (a != b).any(), start, end)
 
 
 def _check_radii(name: str, inner: Scalar, outer: Scalar) -> None:

@@ -15,7 +15,12 @@ from mpmjax.implicit._hessian import (
     TangentAction as TangentAction,
 )
 from mpmjax.implicit._linear_solve import (
+    AbstractInnerProduct as AbstractInnerProduct,
     AbstractInnerProductSolver as AbstractInnerProductSolver,
+    AbstractPreconditioner as AbstractPreconditioner,
+    DiagonalInnerProduct as DiagonalInnerProduct,
+    DiagonalPreconditioner as DiagonalPreconditioner,
+    MassPreconditioner as MassPreconditioner,
     SolveInfo as SolveInfo,
     no_solve as no_solve,
     require_solver as require_solver,
@@ -23,13 +28,6 @@ from mpmjax.implicit._linear_solve import (
 from mpmjax.implicit._newton import Newton as Newton
 from mpmjax.implicit._operator import ImplicitOperator as ImplicitOperator, Projection as Projection
 from mpmjax.implicit._potential import ElasticPotential as ElasticPotential
-from mpmjax.implicit._preconditioner import (
-    AbstractInnerProduct as AbstractInnerProduct,
-    AbstractPreconditioner as AbstractPreconditioner,
-    DiagonalInnerProduct as DiagonalInnerProduct,
-    DiagonalPreconditioner as DiagonalPreconditioner,
-    MassPreconditioner as MassPreconditioner,
-)
 from mpmjax.implicit._stage import (
     AbstractStageSolver as AbstractStageSolver,
     Guess as Guess,

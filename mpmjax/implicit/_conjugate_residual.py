@@ -14,9 +14,14 @@ from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
 from mpmjax.discretisation import Basis, resist_unscaled, stencil_operands, sums_fit, without_flat
 from mpmjax.implicit._hessian import ParticleStiffness
-from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, AbstractInnerProductSolver, default_rtol
+from mpmjax.implicit._linear_solve import (
+    NEARLY_CONVERGED,
+    AbstractInnerProduct,
+    AbstractInnerProductSolver,
+    DiagonalInnerProduct,
+    default_rtol,
+)
 from mpmjax.implicit._operator import ImplicitOperator, rest_of_product, vectors_fit
-from mpmjax.implicit._preconditioner import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.native import NativeFunction, call_library
 
 NEGLIGIBLE_CHANGE = 1e-3
@@ -27,7 +32,7 @@ _BLOCK_SIZE = 64  # as in native/vectors.h
 _Combination = tuple[Array, Scalar, Array]
 
 
-class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
+class ConjugateResidual(AbstractInnerProductSolver):
     """The conjugate residual method for a symmetric operator A, definite or not (E. Stiefel, Comment. Math. Helv. 29
     (1955) 157, doi 10.1007/BF02564277; the recurrence is derivation, eq. 19).
 
@@ -78,7 +83,7 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
             require_positive("ConjugateResidual's increment_rtol", self.increment_rtol)
         require(self.max_steps >= 1, f"ConjugateResidual's max_steps must be at least 1, got {self.max_steps}.")
 
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> lx.AbstractLinearOperator:
+    def init(self, operator: Any, options: dict[str, Any]) -> Any:
         if not isinstance(operator, ImplicitOperator) and not lx.is_symmetric(operator):
             raise ValueError("ConjugateResidual needs a symmetric operator; tag it lineax.symmetric_tag if it is one.")
         if "preconditioner" in options:
@@ -88,9 +93,7 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
             )
         return operator
 
-    def compute(
-        self, state: lx.AbstractLinearOperator, vector: Any, options: dict[str, Any]
-    ) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
+    def compute(self, state: Any, vector: Any, options: dict[str, Any]) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
         flat, unravel = ravel_pytree(vector)
         rtol = options.get("rtol", default_rtol(flat.dtype)) if self.rtol is None else self.rtol
         x = jnp.zeros_like(flat) if options.get("y0") is None else ravel_pytree(options["y0"])[0]

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
+from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector, Scalar
 from mpmjax.checks import require_fields
 from mpmjax.discretisation import Stencil, resist
-from mpmjax.implicit._potential import ElasticPotential, displacement_gradient, joined
+from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.material import AbstractMaterial
 from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror, added, scattered
+from mpmjax.state import MaterialPoints
 
 Tangents = tuple[Callable[[Deformation], Deformation], ...]
 """The stress differential δF ↦ δP [Pa] of each material's particles, both of F's shape."""
@@ -117,9 +118,8 @@ class TangentAction(AbstractHessianAction):
     def __call__(self, du: NodeVector) -> NodeVector:
         """Σ_p V0_p δP_p h_ip, with δP_p = ∂²Ψ/∂F∂F : δF_p (derivation, eqs. 7 and 8), and what terms add."""
         potential, moved = self.potential, self.potential.displaced(du)
-        changes = potential.change(displacement_gradient(moved))
-        stress = tuple(tangent(dF) for tangent, dF in zip(self.tangents, changes, strict=True))
-        elastic = Forces(slopes=jnp.swapaxes(potential.weighted_stress(stress), 0, 1))
+        stress = tuple(tangent(dF) for tangent, dF in zip(self.tangents, potential.change(moved), strict=True))
+        elastic = Forces(slopes=la.transpose(potential.weighted_stress(stress)))
         return potential.on_nodes([elastic, *(part(moved) for part in self._others())])
 
     def precomputed(self) -> ParticleStiffness:
@@ -127,7 +127,7 @@ class TangentAction(AbstractHessianAction):
         pairs = zip(potential.material_points, self.tangents, strict=True)
         upper, coupled = zip(*(points.stiffness(tangent, d) for points, tangent in pairs), strict=True)
         return ParticleStiffness(
-            joined(upper),
+            jnp.concatenate(upper, axis=-1),
             potential.stencil,
             potential.mirror,
             self.positive_semidefinite,
@@ -160,8 +160,19 @@ class DampedAction(AbstractHessianAction):
         return self.elastic(du) + self.rate * self.potential.viscous_resistance(du)
 
     def precomputed(self) -> ParticleStiffness:
-        stiffness, damping = self.elastic.precomputed(), self.potential.damping_matrices()
-        upper = stiffness.upper if damping is None else stiffness.upper + self.rate * damping
+        stiffness, d = self.elastic.precomputed(), self.potential.stencil.dim
+
+        def damping(points: MaterialPoints) -> Array:
+            def flux_of(slopes: Matrix) -> Matrix:
+                return la.transpose(points.weighted_viscous_stress(la.transpose(slopes)))
+
+            like = jnp.zeros((d, d, *points.volume.shape), points.volume.dtype)
+            return la.upper_triangle(la.matrix_of(flux_of, like))
+
+        upper = stiffness.upper
+        if self.potential.material_viscous:
+            parts = [damping(points) for points in self.potential.material_points]
+            upper = upper + self.rate * jnp.concatenate(parts, axis=-1)
         others = tuple(part.damped(self.rate) for part in stiffness.others)
         return eqx.tree_at(lambda s: (s.upper, s.others), stiffness, (upper, others))
 
@@ -178,9 +189,10 @@ class AbstractHessian(eqx.Module):
     def at(self, potential: ElasticPotential, u: NodeVector | None) -> AbstractHessianAction:
         """The Hessian of the potential at a nodal displacement u [m], shape (n, d); None for u = 0."""
 
-    @abc.abstractmethod
     def exact(self) -> "AbstractHessian":
-        """The Hessian that this one approximates, or this one. Derivatives of a solution by Newton's method use it."""
+        """The Hessian that this one approximates, which derivatives of a solution by Newton's method use. Default: this
+        one."""
+        return self
 
 
 class AnalyticHessian(AbstractHessian):
@@ -211,30 +223,14 @@ class AnalyticHessian(AbstractHessian):
 
 
 class JvpHessian(AbstractHessian):
-    """The Hessian by `jax.jvp` of the energy's gradient. It needs only the energy of a law, and is the reference of
-    the tests for `AnalyticHessian`."""
+    """The Hessian by `jax.jvp` of the gradient of each law's energy. It needs only the energy of a law."""
 
-    def at(self, potential: ElasticPotential, u: NodeVector | None) -> AbstractHessianAction:
-        return _JvpAction(potential, potential.displaced(None).nodes if u is None else u)
+    def at(self, potential: ElasticPotential, u: NodeVector | None) -> TangentAction:
+        def differential(law: AbstractMaterial, F: Deformation) -> Callable[[Deformation], Deformation]:
+            stress = jax.grad(lambda F: law.energy(F).sum())
+            return lambda dF: jax.jvp(stress, (F,), (dF,))[1]
 
-    def exact(self) -> "JvpHessian":
-        return self
-
-
-class _JvpAction(AbstractHessianAction):
-    potential: ElasticPotential
-    u: NodeVector
-
-    def is_positive_semidefinite(self) -> bool:
-        return False
-
-    @eqx.filter_jit
-    def __call__(self, du: NodeVector) -> NodeVector:
-        """The derivative of ∂Φ/∂u in the direction δu."""
-        return jax.jvp(jax.grad(self.potential.energy), (self.u,), (du,))[1]
-
-    def precomputed(self) -> ParticleStiffness:
-        return _tangents_of(self.potential, self.u, _jvp_tangent).precomputed()
+        return _tangents_of(potential, u, differential)
 
 
 def _tangents_of(
@@ -248,8 +244,3 @@ def _tangents_of(
     pairs = zip(potential.material_points, potential.deformation(u), strict=True)
     tangents = tuple(points.stress_differential(F, of_law, definite=definite) for points, F in pairs)
     return TangentAction(potential, tangents, definite, u)
-
-
-def _jvp_tangent(law: AbstractMaterial, F: Deformation) -> Callable[[Deformation], Deformation]:
-    stress = jax.grad(lambda F: law.energy(F).sum())
-    return lambda dF: jax.jvp(stress, (F,), (dF,))[1]

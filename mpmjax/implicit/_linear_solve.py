@@ -1,19 +1,18 @@
-"""One linear solve by any symmetric solver of lineax, and the report of solves."""
+"""One linear solve by any symmetric solver of lineax, preconditioned: inner products, the report of solves."""
 
 import abc
 import math
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector
 from mpmjax.checks import require_that
 from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.implicit._preconditioner import AbstractInnerProduct
 
-_State = TypeVar("_State")
 _DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}  # by bytes a number
 
 NEARLY_CONVERGED = 10.0
@@ -76,24 +75,105 @@ def no_solve(dtype: Any) -> SolveInfo:
     return SolveInfo(count, count, count, residual=zero, converged=~no, nearly_converged=no, indefinite=no, report=zero)
 
 
-class AbstractInnerProductSolver(lx.AbstractLinearSolver[_State], Generic[_State]):
-    """A symmetric solver that takes an inner product itself.
+class AbstractInnerProduct(eqx.Module):
+    """The inner product ⟨a, b⟩ = aᵀ W b with a symmetric positive definite W = L Lᵀ.
 
-    `compute` takes the option `inner_product`, an `AbstractInnerProduct`. Its result is successful if it converged. Its
-    statistics are `num_steps`, `residual`, `nearly_converged` and `indefinite` (see `SolveInfo`), and
-    `spectral_radius`, a lower estimate of ‖W⁻¹A‖.
+    W is a preconditioner of a symmetric A: W⁻¹A is self-adjoint in this inner product, and the number of iterations
+    grows with the spread of its eigenvalues. `ConjugateResidual` works on W⁻¹A. Any other solver is given L⁻¹A L⁻ᵀ,
+    which has the same eigenvalues and is symmetric in the plain inner product.
+
+    The W of an `ImplicitOperator` must commute with its projection Q, W = Q W Q + (I − Q) W (I − Q), so that residuals
+    and steps have no part in held components.
     """
 
     @abc.abstractmethod
-    def compute(self, state: _State, vector: Any, options: dict[str, Any]) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
-        """Solve A x = vector. See `lineax.AbstractLinearSolver.compute`."""
+    def apply(self, v: Any) -> Any:
+        """W v."""
+
+    @abc.abstractmethod
+    def solve_factor(self, r: Any) -> Any:
+        """L⁻¹ r."""
+
+    @abc.abstractmethod
+    def solve_factor_transpose(self, v: Any) -> Any:
+        """L⁻ᵀ v."""
+
+    def solve(self, r: Any) -> Any:
+        """W⁻¹ r."""
+        return self.solve_factor_transpose(self.solve_factor(r))
+
+    def factored(self) -> "AbstractInnerProduct":
+        """The inner product for solvers that need L: this one, if it has the factor."""
+        return self
 
 
-def derivative_rtol(dtype: Any) -> float:
-    """The default relative tolerance of tangent and adjoint solves: 1e-8 in float64, 1e-6 in float32. In float32 it is
-    smaller than that of a step: in slow motion of stiff bodies the stiff parts of the right-hand side cancel, and the
-    derivative's error is some hundred times the tolerance."""
-    return min(default_rtol(dtype), 1e-6)
+class DiagonalInnerProduct(AbstractInnerProduct):
+    """The inner product of a diagonal W.
+
+    Args:
+        weight: the positive diagonal, of the structure of a vector.
+    """
+
+    weight: Any
+
+    def apply(self, v: Any) -> Any:
+        return jax.tree.map(jnp.multiply, self.weight, v)
+
+    def solve_factor(self, r: Any) -> Any:
+        return jax.tree.map(lambda r, w: r / jnp.sqrt(w), r, self.weight)
+
+    def solve_factor_transpose(self, v: Any) -> Any:
+        return self.solve_factor(v)
+
+    def solve(self, r: Any) -> Any:
+        return jax.tree.map(jnp.divide, r, self.weight)
+
+
+class AbstractPreconditioner(eqx.Module):
+    """A symmetric positive definite approximation W of M + χH that is easily inverted.
+
+    The number of iterations grows with the spread of the eigenvalues of W⁻¹(M + χH). The tolerance of a solve is that
+    of its residual in the norm of W⁻¹. Subclass it for a preconditioner of your own.
+    """
+
+    advice: ClassVar[str | None] = None
+    """The remedy where solves do not converge, as words that follow "or"; None if nothing better is known."""
+
+    @abc.abstractmethod
+    def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
+        """The inner product of W. W must commute with the operator's projection; for a diagonal,
+        `operator.projection.commuting_weight` makes it so."""
+
+
+class DiagonalPreconditioner(AbstractPreconditioner):
+    """M + χ diag(H) without negative parts of H. The default.
+
+    The saving depends on the scene. In bodies of halves, layers and inclusions at contrasts of 10 to 10 000, in two and
+    three dimensions, it took between an eighth and three fifths of the iterations of `MassPreconditioner` at a hundred
+    times the explicit limit, and between a third and all of them at twenty times. In homogeneous bodies it took between
+    a third of them and a fifth more.
+    """
+
+    def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
+        return DiagonalInnerProduct(operator.projection.commuting_weight(operator.diagonal()))
+
+
+class MassPreconditioner(AbstractPreconditioner):
+    """M: W⁻¹A is then the matrix of eq. 6 of the derivation."""
+
+    advice: ClassVar[str | None] = "take preconditioner=DiagonalPreconditioner(), which needs fewer iterations"
+
+    def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
+        return DiagonalInnerProduct(operator.projection.commuting_weight(operator.nodal_mass()))
+
+
+class AbstractInnerProductSolver(lx.AbstractLinearSolver[Any]):
+    """A symmetric solver that takes an inner product itself.
+
+    `init` is given an `ImplicitOperator`, `compute` the option `inner_product`, an `AbstractInnerProduct`. Its result
+    is successful if it converged. Its statistics are `num_steps`, `residual`, `nearly_converged` and `indefinite` (see
+    `SolveInfo`), and `spectral_radius`, a lower estimate of ‖W⁻¹A‖.
+    """
 
 
 def solve_linear(
@@ -124,21 +204,19 @@ def solve_linear(
     Raises:
         ValueError: the solver refuses the operator, or returns no vector.
     """
-    if not isinstance(solver, AbstractInnerProductSolver):
-        return _solve_scaled(solver, operator, rhs, inner.factored(), guess)
-    options: dict[str, Any] = {"inner_product": inner}
-    options |= {} if guess is None else {"y0": guess}
-    options |= {} if rtol is None else {"rtol": rtol}
-    x, result, stats = solver.compute(solver.init(operator, options), rhs, options)
-    converged = result == lx.RESULTS.successful
-    info = _info(stats["num_steps"], stats["residual"], converged, stats["nearly_converged"], stats["indefinite"])
-    return x, info, stats["spectral_radius"]
-
-
-def _info(iterations: Array, residual: Array, converged: Array, nearly: Array, indefinite: Array) -> SolveInfo:
-    """The report of one linear solve."""
-    none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(residual)
-    return SolveInfo(iterations, none, none, residual, converged, nearly, indefinite, zero)
+    if isinstance(solver, AbstractInnerProductSolver):
+        options: dict[str, Any] = {"inner_product": inner}
+        options |= {} if guess is None else {"y0": guess}
+        options |= {} if rtol is None else {"rtol": rtol}
+        state: Any = solver.init(operator, options)  # pyright: ignore[reportArgumentType]
+        x, result, stats = solver.compute(state, rhs, options)
+        iterations, residual, radius = stats["num_steps"], stats["residual"], stats["spectral_radius"]
+        quality = result == lx.RESULTS.successful, stats["nearly_converged"], stats["indefinite"]
+    else:
+        x, iterations, residual, quality = _solve_scaled(solver, operator, rhs, inner.factored(), guess)
+        radius = jnp.ones_like(residual)
+    none = jnp.zeros((), jnp.int32)
+    return x, SolveInfo(iterations, none, none, residual, *quality, report=jnp.zeros_like(residual)), radius
 
 
 def _solve_scaled(
@@ -147,8 +225,9 @@ def _solve_scaled(
     rhs: NodeVector,
     inner: AbstractInnerProduct,
     guess: NodeVector | None,
-) -> tuple[NodeVector, SolveInfo, Float[Array, ""]]:
-    name, definite = type(solver).__name__, lx.is_positive_semidefinite(operator)
+) -> tuple[NodeVector, Array, Array, tuple[Array, Array, Array]]:
+    """x, the iterations, the relative residual; whether the solve converged, did nearly, and met an indefinite A."""
+    name, definite = type(solver).__name__, operator.hessian.is_positive_semidefinite()
     b = inner.solve_factor(rhs)
     size = jnp.sqrt((b**2).sum())
     size = jnp.where(size == 0, 1, size)
@@ -179,12 +258,16 @@ def _solve_scaled(
             f"{name}.compute must return a solution of the right-hand side's shape, {b.shape}, got {jnp.shape(y)}."
         )
     Ay = scaled.mv(y)
-    residual, tolerance = jnp.sqrt(((b - Ay) ** 2).sum()), _tolerance(solver, b)
+    residual = jnp.sqrt(((b - Ay) ** 2).sum())
+    rtol, atol = getattr(solver, "rtol", None), getattr(solver, "atol", None)
+    if rtol is None and atol is None:
+        tolerance = default_rtol(b.dtype)
+    else:  # atol is of each component of a right-hand side of norm one
+        tolerance = (0 if rtol is None else rtol) + math.sqrt(b.size) * (0 if atol is None else atol)
     converged = (result == lx.RESULTS.successful) & (residual <= tolerance)
     nearly = ~converged & (residual <= NEARLY_CONVERGED * tolerance)
     iterations = jnp.asarray(stats.get("num_steps", 0), dtype=jnp.int32)
-    info = _info(iterations, residual, converged, nearly, (y * Ay).sum() < 0)
-    return size * inner.solve_factor_transpose(y), info, jnp.ones_like(residual)
+    return size * inner.solve_factor_transpose(y), iterations, residual, (converged, nearly, (y * Ay).sum() < 0)
 
 
 def require_solver(name: str, solver: lx.AbstractLinearSolver) -> None:
@@ -200,12 +283,3 @@ def require_solver(name: str, solver: lx.AbstractLinearSolver) -> None:
             lambda a: a > 0,
             atol,
         )
-
-
-def _tolerance(solver: lx.AbstractLinearSolver, b: Array) -> Any:
-    """The relative residual of a solver's tolerances: `rtol`, plus `atol` in each component of a right-hand side of
-    norm one; that of the precision for a solver without them."""
-    rtol, atol = getattr(solver, "rtol", None), getattr(solver, "atol", None)
-    if rtol is None and atol is None:
-        return default_rtol(b.dtype)
-    return (0 if rtol is None else rtol) + math.sqrt(b.size) * (0 if atol is None else atol)

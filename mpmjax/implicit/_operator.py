@@ -1,4 +1,4 @@
-"""The matrix of implicit solves, M + χH on free components, as a lineax operator."""
+"""The matrix of implicit solves, M + χH on free components."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -7,7 +7,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
@@ -51,9 +50,9 @@ class Projection(eqx.Module):
         return jnp.where(self.free, mass[:, None], 1) * vector if self.normals else vector
 
 
-class ImplicitOperator(lx.AbstractLinearOperator):
-    """Q (M + χ H) Q + I − Q [kg] (derivation, eq. 21), with χ = βΔt² for the semi-implicit step and Δt_s² for a stage
-    of length Δt_s.
+class ImplicitOperator(eqx.Module):
+    """The symmetric matrix A = Q (M + χ H) Q + I − Q [kg] (derivation, eq. 21), with χ = βΔt² for the semi-implicit
+    step and Δt_s² for a stage of length Δt_s.
 
     Q projects on free components (see `Projection`). Rows of prescribed components and of empty nodes are those of the
     identity; along a held normal the operator is the mass.
@@ -72,6 +71,7 @@ class ImplicitOperator(lx.AbstractLinearOperator):
         return self.mass[:, None] * v + self.factor * self.hessian(v)
 
     def mv(self, vector: NodeVector) -> NodeVector:
+        """A v."""
         combine = self.projection.combine
         return combine(self.unconstrained(combine(vector, 0)), self.projection.identity_rows(vector, self.mass))
 
@@ -111,38 +111,14 @@ class ImplicitOperator(lx.AbstractLinearOperator):
         return self.mass[:, None] + self.factor * self.hessian.precomputed().diagonal(len(self.mass))
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
+        """Shape and dtype of a vector."""
         return jax.ShapeDtypeStruct(self.projection.free.shape, self.mass.dtype)
 
-    def out_structure(self) -> jax.ShapeDtypeStruct:
-        return self.in_structure()
-
     def as_matrix(self) -> Float[Array, "nd nd"]:
+        """A as a dense matrix."""
         vector = self.in_structure()
         columns = jax.vmap(lambda e: self.mv(e.reshape(vector.shape)).reshape(-1))
         return columns(jnp.eye(vector.size, dtype=vector.dtype)).T
-
-    def transpose(self) -> "ImplicitOperator":
-        return self
-
-
-def _register() -> None:
-    """The operator's properties for lineax: it is symmetric, and otherwise of no structure."""
-    lx.is_symmetric.register(ImplicitOperator, lambda operator: True)
-    lx.is_positive_semidefinite.register(ImplicitOperator, lambda operator: operator.hessian.is_positive_semidefinite())
-    for absent in (
-        lx.is_diagonal,
-        lx.is_tridiagonal,
-        lx.has_unit_diagonal,
-        lx.is_lower_triangular,
-        lx.is_upper_triangular,
-        lx.is_negative_semidefinite,
-    ):
-        absent.register(ImplicitOperator, lambda operator: False)
-    for same in (lx.linearise, lx.materialise, lx.conj):
-        same.register(ImplicitOperator, lambda operator: operator)
-
-
-_register()
 
 
 def _product(*args: Array) -> list[Array]:

@@ -22,7 +22,12 @@ class ElasticPotential(eqx.Module):
     in the step.
 
     h_ip is the material gradient: F_pᵀ ∇_x w_ip in the updated description, ∇_X w_ip in the total one. It enters only
-    by `change` and its transpose, `nodal_sum` of `weighted_stress`, so that force and Hessian are derivatives of Φ.
+    by `change` and its transpose, `weighted_stress`, so that force and Hessian are derivatives of Φ.
+
+    Materials are no `AbstractTerm`: all of them together have one matrix a particle, in one array that the solver
+    applies in a pass, and the integrator chooses how it is made (`AbstractHessian`), where a term states its own
+    stiffness. What they are asked besides, how G2P strains them and the eigenvalues that bound the step, no other term
+    has, so that the sums over one tuple would be longer than these over two.
     """
 
     material_points: tuple[MaterialPoints, ...]
@@ -37,16 +42,13 @@ class ElasticPotential(eqx.Module):
         """A displacement or velocity of the nodes, shape (n, d), with that of their mirror images; None for zero."""
         return Displacement(self.stencil, self.size, None if u is None else self.mirror.unfold(u))
 
-    def unfolded(self, forces: Sequence[Forces]) -> NodeVector:
-        """The sum of forces on all nodes [N], shape (n, d), not folded at mirrors."""
-        return scattered(forces, self.stencil, self.size)
-
     def on_nodes(self, forces: Sequence[Forces]) -> NodeVector:
         """The sum of forces on the nodes [N], shape (n, d)."""
         return self.mirror.fold(scattered(forces, self.stencil, self.size))
 
-    def change(self, gradient: Matrix) -> Deformations:
-        """δF_p from the gradient Σ_i u_i g_ipᵀ of the displacement, one array for each material."""
+    def change(self, moved: Displacement) -> Deformations:
+        """δF_p by a displacement, one array for each material."""
+        gradient = la.transpose(moved.at_particles[1])
         return tuple(points.change(points.rows_of(gradient)) for points in self.material_points)
 
     def deformation(self, u: NodeVector | Displacement | None) -> Deformations:
@@ -55,7 +57,7 @@ class ElasticPotential(eqx.Module):
         moved = u if isinstance(u, Displacement) else self.displaced(u)
         if moved.at_rest:
             return current
-        return tuple(F + dF for F, dF in zip(current, self.change(displacement_gradient(moved)), strict=True))
+        return tuple(F + dF for F, dF in zip(current, self.change(moved), strict=True))
 
     def energy(self, u: NodeVector | Displacement) -> Float[Array, ""]:
         """Φ(u) [J]."""
@@ -82,25 +84,19 @@ class ElasticPotential(eqx.Module):
         moved = self.displaced(u)
         pairs = zip(self.material_points, self.deformation(moved), strict=True)
         elastic = self.weighted_stress([points.stress(F) for points, F in pairs])
-        return self.on_nodes([Forces(slopes=-jnp.swapaxes(elastic, 0, 1)), *(term.force(moved) for term in self.terms)])
+        return self.on_nodes([Forces(slopes=-la.transpose(elastic)), *(term.force(moved) for term in self.terms)])
 
-    def weighted_stress(self, P: Sequence[Deformation]) -> Matrix:
-        """V0_p P_p F_pᵀ [J], shape (d, d, p), from the stress of each material; in the total description V0_p P_p."""
-        d = self.stencil.dim
-        return joined(
-            [points.weighted_stress(stress, d) for points, stress in zip(self.material_points, P, strict=True)]
-        )
-
-    def current_weighted_stress(self) -> Matrix:
-        """V0_p P_p F_pᵀ at u = 0 [J], shape (d, d, p), of which the force is f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip."""
-        return self.weighted_stress([points.stress(points.deformation) for points in self.material_points])
+    def weighted_stress(self, P: Sequence[Deformation] | None = None) -> Matrix:
+        """V0_p P_p F_pᵀ [J], shape (d, d, p), of which the force is f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip; in the total
+        description V0_p P_p. P is the stress of each material [Pa]. Default: at u = 0."""
+        d, each = self.stencil.dim, self.material_points
+        P = [points.stress(points.deformation) for points in each] if P is None else P
+        return jnp.concatenate([q.weighted_stress(stress, d) for q, stress in zip(each, P, strict=True)], axis=-1)
 
     @property
     def viscous(self) -> bool:
         """Whether any of the materials has viscosity, or any of the terms a resistance."""
-        return any(points.viscosity is not None for points in self.material_points) or any(
-            term.viscous for term in self.terms
-        )
+        return self.material_viscous or any(term.viscous for term in self.terms)
 
     @property
     def material_viscous(self) -> bool:
@@ -110,57 +106,28 @@ class ElasticPotential(eqx.Module):
     def weighted_viscous_stress(self, gradient: Matrix) -> Matrix:
         """|J| V0 σ_v of each particle [J], whose sum over g_ip is D v, at the particles' velocity gradient [1/s]; both
         of shape (d, d, p)."""
-        return joined([points.weighted_viscous_stress(points.rows_of(gradient)) for points in self.material_points])
+        parts = [points.weighted_viscous_stress(points.rows_of(gradient)) for points in self.material_points]
+        return jnp.concatenate(parts, axis=-1)
+
+    def resistances(self, moved: Displacement) -> list[Forces]:
+        """The parts of D v before the scatter, of materials and terms."""
+        parts = [part for term in self.terms if (part := term.resistance(moved)) is not None]
+        if self.material_viscous:
+            stress = self.weighted_viscous_stress(la.transpose(moved.at_particles[1]))
+            parts.append(Forces(slopes=la.transpose(stress)))
+        return parts
 
     def viscous_resistance(self, v: NodeVector) -> NodeVector:
         """D v [N], the negative of the viscous force at a nodal velocity v [m/s]. D is symmetric and positive
         semi-definite."""
-        moved = self.displaced(v)
-        parts = [r for term in self.terms if (r := term.resistance(moved)) is not None]
-        if self.material_viscous:
-            parts.append(Forces(slopes=jnp.swapaxes(self.weighted_viscous_stress(displacement_gradient(moved)), 0, 1)))
+        parts = self.resistances(self.displaced(v))
         return self.on_nodes(parts) if parts else jnp.zeros_like(v)
 
     def power(self, v: NodeVector) -> Float[Array, ""]:
         """v·D v [W], the power that viscosity dissipates at a nodal velocity v [m/s]."""
         moved = self.displaced(v)
-        parts = [r for term in self.terms if (r := term.resistance(moved)) is not None]
-        power = (moved.nodes * self.unfolded(parts)).sum() if parts else jnp.zeros((), v.dtype)
-        if not self.material_viscous:
-            return power
-        gradient = displacement_gradient(moved)
-        return power + (self.weighted_viscous_stress(gradient) * gradient).sum()
+        return sum((part.product(moved) for part in self.resistances(moved)), jnp.zeros((), v.dtype))
 
     def drags(self) -> list[tuple[Forces, Float[Array, ""]]]:
         """The viscous forces of the terms at the start of the step, and their powers (see `AbstractTerm.drag`)."""
         return [drag for term in self.terms if (drag := term.drag(self.size)) is not None]
-
-    def nodal_sum(self, flux: Matrix) -> NodeVector:
-        """Σ_p flux_p g_ip [N], shape (n, d)."""
-        return self.on_nodes([Forces(slopes=jnp.swapaxes(flux, 0, 1))])
-
-    def damping_matrices(self) -> Float[Array, "t p"] | None:
-        """The matrices of the materials' D [J s], one for each particle, as `stiffness` has those of H; None if no
-        material has viscosity."""
-        if not self.material_viscous:
-            return None
-        d = self.stencil.dim
-
-        def matrix(points: MaterialPoints) -> Array:
-            def flux_of(slopes: Matrix) -> Matrix:
-                return la.transpose(points.weighted_viscous_stress(la.transpose(slopes)))
-
-            like = jnp.zeros((d, d, *points.volume.shape), points.volume.dtype)
-            return la.upper_triangle(la.matrix_of(flux_of, like))
-
-        return joined([matrix(points) for points in self.material_points])
-
-
-def displacement_gradient(moved: Displacement) -> Matrix:
-    """∇u of each particle."""
-    return jnp.swapaxes(moved.at_particles[1], 0, 1)
-
-
-def joined(parts: Sequence[Array]) -> Array:
-    """Arrays of the materials, as one over all particles."""
-    return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)

@@ -20,10 +20,15 @@ from mpmjax.autodiff import ruled, saved_for_backward, without_derivative
 from mpmjax.checks import require_fields
 from mpmjax.implicit._conjugate_residual import ConjugateResidual
 from mpmjax.implicit._hessian import AbstractHessian, AbstractHessianAction, DampedAction
-from mpmjax.implicit._linear_solve import SolveInfo, default_rtol, require_solver, solve_linear
+from mpmjax.implicit._linear_solve import (
+    AbstractPreconditioner,
+    SolveInfo,
+    default_rtol,
+    require_solver,
+    solve_linear,
+)
 from mpmjax.implicit._operator import ImplicitOperator, Projection
 from mpmjax.implicit._potential import ElasticPotential
-from mpmjax.implicit._preconditioner import AbstractPreconditioner
 
 _DERIVATIVE_RTOL = 1e-6
 """Largest default relative tolerance of tangent and adjoint solves. In float32 it is smaller than that of a step: in
@@ -43,16 +48,6 @@ class Guess(enum.Enum):
     """v*, the explicitly updated velocity (derivation, eq. 4)."""
     ZERO = "zero"
     """Zero velocity."""
-
-    def velocity(self, before: NodeVector, explicit: NodeVector) -> NodeVector:
-        """The guess [m/s], shape (n, d), from v^n and v*."""
-        match self:
-            case Guess.GRID_VELOCITY:
-                return before
-            case Guess.EXPLICIT:
-                return explicit
-            case Guess.ZERO:
-                return jnp.zeros_like(before)
 
 
 class StageProblem(eqx.Module):

@@ -95,7 +95,7 @@ def double_dot(A: Float[Array, "a b *p"], B: Float[Array, "a b *p"]) -> Array:
 def determinant(A: Matrix) -> Array:
     """det A, shape (*batch)."""
     a = entries(A)
-    return dot(a[0], cofactors(a)[0])
+    return a[0][0] * a[1][1] - a[0][1] * a[1][0] if len(a) == 2 else dot(a[0], cofactors(a)[0])
 
 
 def cofactor(A: Matrix) -> Matrix:

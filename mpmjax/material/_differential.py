@@ -92,6 +92,24 @@ class PrincipalDifferential(eqx.Module):
         entries = [[scaling(i, j) for j in range(d)] for i in range(d)]
         return cls(over_pairs(twist), over_pairs(flip), la.assemble(entries))
 
+    @classmethod
+    def of_kirchhoff(
+        cls,
+        s: Float[Array, "d *p"],
+        tau: Float[Array, "d *p"],
+        growth: Callable[[int, int], Array],
+        slope: Callable[[int, int], Array],
+    ) -> "PrincipalDifferential":
+        """From the principal Kirchhoff stresses τ_i = s_i ∂Ψ/∂s_i [Pa], ∂τ_i/∂ln s_j and (τ_i − τ_j)/(s_i − s_j) [Pa]:
+        twist (τ_i/s_i + τ_j/s_j)/(s_i + s_j), flip (s_j (τ_i − τ_j)/(s_i − s_j) − τ_j)/(s_i s_j), scaling
+        (∂τ_i/∂ln s_j − δ_ij τ_i)/(s_i s_j)."""
+        return cls.of(
+            s,
+            twist=lambda i, j: (tau[i] / s[i] + tau[j] / s[j]) / (s[i] + s[j]),
+            flip=lambda i, j: (s[j] * slope(i, j) - tau[j]) / (s[i] * s[j]),
+            scaling=lambda i, j: (growth(i, j) - (tau[i] if i == j else 0)) / (s[i] * s[j]),
+        )
+
 
 class IsotropicDifferential(AbstractDifferential):
     """The stress differential as the derivative of an isotropic law's stress."""

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Compliance, Float, Matrix, PerParticle
+from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.checks import require_fields, require_moduli
-from mpmjax.material._differential import AbstractDifferential, PrincipalDifferential, isotropic_matrix
+from mpmjax.material._differential import IsotropicDifferential, PrincipalDifferential
 from mpmjax.material._law import AbstractMaterial
 
 
@@ -66,11 +66,9 @@ class FixedCorotated(AbstractIsotropic):
         volumetric = self.lame_lambda * (la.determinant(F) - 1)
         return 2 * self.shear_modulus * (F - la.rotation(F)) + volumetric * la.cofactor(F)
 
-    def stress_differential(self, F: Matrix) -> "FixedCorotatedDifferential":
-        R, cof = la.rotation(F), la.cofactor(F)
-        compliance = la.spin_compliance(la.matmul(la.transpose(R), F))
-        volumetric = self.lame_lambda * (la.determinant(F) - 1)
-        return FixedCorotatedDifferential(self, F, R, compliance, cof, volumetric)
+    def stress_differential(self, F: Matrix) -> IsotropicDifferential:
+        """δP = 2μ (δF − δR) + λ (J F⁻ᵀ : δF) J F⁻ᵀ + λ (J − 1) δ(J F⁻ᵀ) (derivation, eq. 11)."""
+        return IsotropicDifferential(self, F)
 
     def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
         """With v = λ (J − 1) J/(s_i s_j): twist 2μ (1 − 2/(s_i + s_j)) + v, flip 2μ − v, scaling
@@ -80,29 +78,6 @@ class FixedCorotated(AbstractIsotropic):
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         return la.finite(F)
-
-
-class FixedCorotatedDifferential(AbstractDifferential):
-    """δP = 2μ (δF − δR) + λ (J F⁻ᵀ : δF) J F⁻ᵀ + λ (J − 1) δ(J F⁻ᵀ) (derivation, eq. 11)."""
-
-    law: FixedCorotated
-    F: Matrix
-    R: Matrix
-    compliance: Compliance
-    cofactor: Matrix
-    volumetric: Array
-
-    def __call__(self, dF: Matrix) -> Matrix:
-        dR = la.rotation_differential(self.R, self.compliance, dF)
-        dJ = la.double_dot(self.cofactor, dF)
-        return (
-            2 * self.law.shear_modulus * (dF - dR)
-            + self.law.lame_lambda * dJ * self.cofactor
-            + self.volumetric * la.cofactor_differential(self.F, dF)
-        )
-
-    def pushed_forward(self, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"]:
-        return isotropic_matrix(self.law, self.F, A, weight)
 
 
 class NeoHookean(AbstractIsotropic):
@@ -127,14 +102,13 @@ class NeoHookean(AbstractIsotropic):
         return mu / 2 * (la.double_dot(F, F) - F.shape[0]) - mu * log_J + lam / 2 * log_J**2
 
     def stress(self, F: Matrix) -> Matrix:
-        pull, _ = self._volumetric(la.determinant(F))
+        pull, _ = self.volumetric(la.determinant(F))
         return self.shear_modulus * F + pull * la.cofactor(F)
 
     def stress_differential(self, F: Matrix) -> "NeoHookeanDifferential":
-        pull, bulk = self._volumetric(la.determinant(F))
-        return NeoHookeanDifferential(F, la.cofactor(F), pull, bulk, self.shear_modulus)
+        return NeoHookeanDifferential(self, F)
 
-    def _volumetric(self, J: Array) -> tuple[Array, Array]:
+    def volumetric(self, J: Array) -> tuple[Array, Array]:
         """q = (λ ln J − μ)/J, by which the cofactor matrix enters the stress, and b = dq/dJ."""
         pull = (self.lame_lambda * jnp.log(J) - self.shear_modulus) / J
         return pull, self.lame_lambda / J**2 - pull / J
@@ -143,39 +117,30 @@ class NeoHookean(AbstractIsotropic):
         """With v = (μ − λ ln J)/(s_i s_j): twist μ − v, flip μ + v, scaling μ + (μ + λ (1 − ln J))/s_i² on the diagonal
         and λ/(s_i s_j) off it."""
         mu, J = self.shear_modulus * jnp.ones_like(s[0]), s.prod(axis=0)
-        pull, bulk = self._volumetric(J)
+        pull, bulk = self.volumetric(J)
         return _with_volumetric(s, pull, bulk, lambda i, j: mu, mu)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         return la.determinant(F) > 0
 
 
-class NeoHookeanDifferential(AbstractDifferential):
+class NeoHookeanDifferential(IsotropicDifferential):
     """δP = μ δF + q δ(J F⁻ᵀ) + b (J F⁻ᵀ : δF) J F⁻ᵀ, with q = (λ ln J − μ)/J and b = λ/J² − q/J = dq/dJ."""
 
-    F: Matrix
-    cofactor: Matrix
-    pull: Array
-    bulk: Array
-    shear_modulus: PerParticle
-
-    def __call__(self, dF: Matrix) -> Matrix:
-        dJ = la.double_dot(self.cofactor, dF)
-        return (
-            self.shear_modulus * dF + self.pull * la.cofactor_differential(self.F, dF) + self.bulk * dJ * self.cofactor
-        )
+    law: NeoHookean
 
     def pushed_forward(self, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"]:
         """w (μ δ_ac (A Aᵀ)_bd + b T_ab T_cd + q ε_ace ε_bdf Y_fe), with T = J F⁻ᵀ Aᵀ and, in 3-D, Y = cof(A) Fᵀ; in
         2-D the last term is q ε_ac ε_bd det A, and in 1-D none."""
-        d, back, pull = len(A), la.transpose(A), weight * self.pull
-        square, first = weight * self.shear_modulus * la.matmul(A, back), la.matmul(self.cofactor, back)
+        d, back, law = len(A), la.transpose(A), self.law
+        pull, bulk = (weight * factor for factor in law.volumetric(la.determinant(self.F)))
+        square, first = weight * law.shear_modulus * la.matmul(A, back), la.matmul(la.cofactor(self.F), back)
         if d == 3:
             second = pull * la.matmul(la.cofactor(A), la.transpose(self.F))
         else:
             second = (pull * la.determinant(A))[None, None]
         # once, and not again in each component
-        computed = jax.lax.optimization_barrier((square, first, weight * self.bulk * first, second))
+        computed = jax.lax.optimization_barrier((square, first, bulk * first, second))
         square, first, bulk, second = map(la.entries, computed)
 
         def entry(b: int, a: int, e: int, c: int) -> Array:

@@ -56,22 +56,16 @@ class Hencky(AbstractIsotropic):
         return IsotropicDifferential(self, F)
 
     def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
-        """With τ_i = 2μ ln s_i + λ (ln J + (3 − d) ε_t): scaling (2μ δ_ij + λ)/(s_i s_j) − δ_ij τ_i/s_i², twist
-        (τ_i/s_i + τ_j/s_j)/(s_i + s_j), flip (2μ s_j ln(s_i/s_j)/(s_i − s_j) − τ_j)/(s_i s_j)."""
+        """With τ_i = 2μ ln s_i + λ (ln J + (3 − d) ε_t) and ∂τ_i/∂ln s_j = 2μ δ_ij + λ."""
         mu, lam = self.shear_modulus, self.lame_lambda * jnp.ones_like(s[0])
         log_s = jnp.log(s)
         tau = 2 * mu * log_s + lam * self._dilation(log_s.sum(axis=0), s)
-
-        def scaling(i: int, j: int) -> Array:
-            return ((2 * mu - tau[i] + lam) if i == j else lam) / (s[i] * s[j])
-
-        def twist(i: int, j: int) -> Array:
-            return (tau[i] / s[i] + tau[j] / s[j]) / (s[i] + s[j])
-
-        def flip(i: int, j: int) -> Array:
-            return (2 * mu * s[j] * _log.slope(s[j], s[i]) - tau[j]) / (s[i] * s[j])
-
-        return PrincipalDifferential.of(s, twist, flip, scaling)
+        return PrincipalDifferential.of_kirchhoff(
+            s,
+            tau,
+            growth=lambda i, j: 2 * mu + lam if i == j else lam,
+            slope=lambda i, j: 2 * mu * _log.slope(s[j], s[i]),
+        )
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         return la.determinant(F) > 0

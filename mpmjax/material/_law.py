@@ -312,10 +312,6 @@ class AbstractMaterial(AbstractLaw):
         """None."""
         del F
 
-    def remembers(self, history: Any, stored: Array, /) -> bool:
-        del stored
-        return history is None
-
     def elastic(self, history: None) -> "AbstractMaterial":
         """The law itself."""
         del history

@@ -1,6 +1,7 @@
 """Laws of rubber: Mooney-Rivlin, Yeoh, Gent and Ogden."""
 
 import abc
+from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
@@ -68,9 +69,7 @@ class AbstractRubber(AbstractMaterial):
 
     def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
         """With p_i = λ̄_i^α − 1 and e_i = p_i − E/3: τ_i = Σ_k w' α e_i + K/2 (J² − 1),
-        ∂τ_i/∂ln s_j = Σ_k α² (w'' e_i e_j + w' ((1 + p_i)(δ_ij − 1/3) − e_j/3)) + K J²; scaling
-        (∂τ_i/∂ln s_j − δ_ij τ_i)/(s_i s_j), twist (τ_i/s_i + τ_j/s_j)/(s_i + s_j), flip
-        (s_j (τ_i − τ_j)/(s_i − s_j) − τ_j)/(s_i s_j)."""
+        ∂τ_i/∂ln s_j = Σ_k α² (w'' e_i e_j + w' ((1 + p_i)(δ_ij − 1/3) − e_j/3)) + K J²."""
         d, J = len(s), s.prod(axis=0)
         log_J = jnp.log(J)
         powers = [PowerLessOne(a * jnp.ones_like(J), -a / 3 * log_J) for a in self.powers()]
@@ -81,24 +80,16 @@ class AbstractRubber(AbstractMaterial):
         tau = sum((a * w.slope * e for a, w, _, _, e in terms), self.bulk_modulus / 2 * (J**2 - 1))
 
         def growth(i: int, j: int) -> Array:
-            """∂τ_i/∂ln s_j."""
             shares = [
                 a**2 * (w.curvature * e[i] * e[j] + w.slope * ((1 + p[i]) * ((i == j) - 1 / 3) - e[j] / 3))
                 for a, w, _, p, e in terms
             ]
             return sum(shares, self.bulk_modulus * J**2)
 
-        def scaling(i: int, j: int) -> Array:
-            return (growth(i, j) - (tau[i] if i == j else 0)) / (s[i] * s[j])
+        def slope(i: int, j: int) -> Array:
+            return reduce(jnp.add, (a * w.slope * power.slope(s[j], s[i]) for a, w, power, _, _ in terms))
 
-        def twist(i: int, j: int) -> Array:
-            return (tau[i] / s[i] + tau[j] / s[j]) / (s[i] + s[j])
-
-        def flip(i: int, j: int) -> Array:
-            slope = sum(a * w.slope * power.slope(s[j], s[i]) for a, w, power, _, _ in terms)
-            return (s[j] * slope - tau[j]) / (s[i] * s[j])
-
-        return PrincipalDifferential.of(s, twist, flip, scaling)
+        return PrincipalDifferential.of_kirchhoff(s, tau, growth, slope)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         return la.determinant(F) > 0

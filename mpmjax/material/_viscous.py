@@ -2,9 +2,13 @@
 
 from typing import Any
 
-from mpmjax._types import Array, Deformation, Float, PerParticle, Scalar
+from mpmjax._types import PerParticle
 from mpmjax.checks import require, require_between, require_fields
-from mpmjax.material._law import AbstractLaw, AbstractMaterial, DeformationMeasure, Viscosity
+from mpmjax.material._law import AbstractLaw, Viscosity
+
+
+def _of_law(name: str) -> Any:
+    return property(lambda self: getattr(self.law, name))
 
 
 class Viscous(AbstractLaw):
@@ -46,43 +50,14 @@ class Viscous(AbstractLaw):
         return Viscosity(self.shear_viscosity, self.bulk_viscosity)
 
     # all else is the law's
-
-    @property
-    def measure(self) -> DeformationMeasure:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.law.measure
-
-    @property
-    def allows_total(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.law.allows_total
-
-    @property
-    def allows_averaged_volume(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.law.allows_averaged_volume
-
-    @property
-    def relaxes_stress(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.law.relaxes_stress
-
-    def hardly_changes_volume(self) -> bool:
-        return self.law.hardly_changes_volume()
-
-    def initial_history(self, F: Deformation) -> Any:
-        return self.law.initial_history(F)
-
-    def compaction(self, history: Any) -> Float[Array, "p"] | float:
-        return self.law.compaction(history)
-
-    def remembers(self, history: Any, stored: Array) -> bool:
-        return self.law.remembers(history, stored)
-
-    def elastic(self, history: Any) -> AbstractMaterial:
-        return self.law.elastic(history)
-
-    def return_map(self, F: Deformation, history: Any, dt: Scalar) -> tuple[Deformation, Any]:
-        return self.law.return_map(F, history, dt)
-
-    def title(self) -> str:
-        return self.law.title()
-
-    def inadmissible(self, or_else: str) -> tuple[str, str]:
-        return self.law.inadmissible(or_else)
+    measure = _of_law("measure")
+    allows_total = _of_law("allows_total")
+    allows_averaged_volume = _of_law("allows_averaged_volume")
+    relaxes_stress = _of_law("relaxes_stress")
+    hardly_changes_volume = _of_law("hardly_changes_volume")
+    initial_history = _of_law("initial_history")
+    compaction = _of_law("compaction")
+    elastic = _of_law("elastic")
+    return_map = _of_law("return_map")
+    title = _of_law("title")
+    inadmissible = _of_law("inadmissible")

@@ -45,6 +45,13 @@ class Forces(NamedTuple):
     slopes: Float[Array, "d d p"] | None = None
     """a_p,b [J], shape (d, d, p), the derivative's direction b first."""
 
+    def product(self, moved: Displacement) -> Float[Array, ""]:
+        """Their work at a displacement [J], or power at a velocity [W]."""
+        total = jnp.zeros((), moved.stencil.offset.dtype) if self.nodes is None else (self.nodes * moved.nodes).sum()
+        for part, at in () if self[1:] == (None, None) else zip(self[1:], moved.at_particles, strict=True):
+            total = total if part is None else total + (part * at).sum()
+        return total
+
 
 def added(forces: Sequence[Forces]) -> Forces:
     """The sum of forces, one or more, before the scatter."""

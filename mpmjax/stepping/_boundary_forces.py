@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Float, Int, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import (
     Impulses,
     OwnedCouple,
@@ -24,14 +24,7 @@ from mpmjax.stepping._nodes import Nodes, places_of
 
 def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> Impulses:
     """The impulse on the scene's colliders, at their places at the time of the forces, by prescribed components, along
-    normals, by springs and friction.
-
-    Args:
-        scene: the scene.
-        nodes: the nodes at the start of the step.
-        method: the integrator.
-        new: their update.
-    """
+    normals, by springs and friction, from the nodes at the start of the step and their update."""
     colliders, share = nodes.conditions.colliders, method.force_at()
     assert colliders is not None
     position, pivots = colliders.position, colliders.pivots
@@ -40,7 +33,7 @@ def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator,
         pivots = pivots + share * nodes.dt * colliders.pivot_velocity
     held, numbers = new.held(nodes), _boundaries_of_colliders(scene)
     holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
-    pushes = () if new.contact is None else held.pushes(new.contact.friction)
+    pushes = () if new.contact is None else held.pushes(new.friction)
     by_springs = [OwnedImpulse(push, numbers.index(number)) for number, push in pushes if number in numbers]
     parts = [OwnedImpulse(holding, colliders.holder), *held.along_normals(holding), *by_springs]
     return received_impulses(parts, position, pivots)
@@ -55,17 +48,8 @@ def impulse_on_boundaries(
     method: AbstractIntegrator,
     new: GridUpdate,
 ) -> Impulses:
-    """The impulse on each boundary of the scene, and on what guides its rigid bodies, in the step from t.
-
-    Args:
-        scene: the scene.
-        particles: the particles at the start of the step.
-        t: time at the start of the step [s].
-        unfolded: the nodes at the start of the step, not folded at symmetry planes.
-        nodes: the same, folded.
-        method: the integrator.
-        new: their update.
-    """
+    """The impulse on each boundary of the scene, and on what guides its rigid bodies, in the step from t, from the
+    nodes at its start, before and after the fold at symmetry planes, and their update."""
     held, force_at, stencil = new.held(nodes), method.force_at(), nodes.potential.stencil
     solved, carrier = new.solved.velocity, new.motion.carrier
     whole, elastic = new.solved, new.elastic
@@ -85,7 +69,11 @@ def impulse_on_boundaries(
     for body, image in zip(scene.rigid_bodies, nodes.mirror.rigid, strict=True):
         guide = scene.guides.get(body.number)
         owners, of_spin = _spread(owners, image, unfolded.mass, planes, body.freedom, guide)
-        couples.append(OwnedCouple(_couple(image, unfolded, nodes, solved), of_spin))
+        # the change of its angular momentum Iω less that of its nodes, which have an inertia and a spin of their own
+        changed = image.own(solved - nodes.velocity)[1]
+        of_nodes = image.own(unfolded.mass[:, None] * (unfold(solved) - unfolded.velocity))
+        couple = image.angular(image.own(nodes.mass)[1] * changed) - moment(image.arms, of_nodes).sum(axis=0)
+        couples.append(OwnedCouple(couple, of_spin))
         soft = image.with_own(soft, jnp.zeros(len(image.arms), dtype=bool))
 
     # springs act on all nodes
@@ -124,8 +112,7 @@ def impulse_on_boundaries(
             parts.append(OwnedImpulse(jnp.where(mine, residual, 0), number))
             taken = taken | mine
 
-    friction_of = () if new.contact is None else new.contact.friction
-    for (number, _, _), change in zip(contacts, friction_of, strict=True):
+    for (number, _, _), change in zip(contacts, new.friction, strict=True):
         of_planes, friction = taken_by_mirrors(unfolded.mass[:, None] * unfold(change), images)
         parts += of_planes
         if number is not None:
@@ -159,15 +146,8 @@ def _spread(
     """The owners where what holds a node of a rigid body holds all of them in this direction, and who holds its spin.
 
     The body's own guides hold what they forbid, else the first one holds. Directions in which nothing is held add up to
-    no force; their moment is that of who holds the spin, or of the guides, about the body's centre then none.
-
-    Args:
-        owners: what boundaries hold, node by node.
-        image: the map of the rigid body.
-        mass: masses of all nodes [kg], shape (n,).
-        planes: the symmetry planes, with their boundaries' numbers.
-        freedom: what the body may do.
-        guide: the number of its guides; None if it has none.
+    no force; their moment is that of who holds the spin, or of the guides, about the body's centre then none. The
+    masses are those of all nodes [kg], shape (n,); planes come with their boundaries' numbers, as the guides' number.
     """
     layer, full = image.own(owners), image.own(mass) > 0
     nobody = jnp.iinfo(layer.dtype).max
@@ -182,21 +162,6 @@ def _spread(
         first = jnp.where(jnp.asarray(freedom.directions), first, guide)
     first, of_spin = (jnp.where(number == nobody, -1, number) for number in (first, of_spin))
     return image.with_own(owners, jnp.broadcast_to(first, layer.shape)), of_spin
-
-
-def _couple(image: RigidImage, unfolded: Nodes, nodes: Nodes, solved: NodeVector) -> Float[Array, "r"]:
-    """The change of a rigid body's angular momentum Iω less that of its nodes [kg m²/s], shape (r,): the nodes have an
-    inertia and a spin of their own.
-
-    Args:
-        image: the map of the rigid body.
-        unfolded: the nodes at the start of the step, not folded.
-        nodes: the same, folded.
-        solved: the folded nodes' velocity at the end, before friction [m/s], shape (n, d).
-    """
-    changed = image.own(solved - nodes.velocity)[1]
-    of_nodes = image.own(unfolded.mass[:, None] * (nodes.mirror.unfold(solved) - unfolded.velocity))
-    return image.angular(image.own(nodes.mass)[1] * changed) - moment(image.arms, of_nodes).sum(axis=0)
 
 
 def _share_of_change(transfer: AbstractTransfer, dim: int, dtype: jnp.dtype) -> Array:

@@ -23,16 +23,8 @@ from mpmjax.state import MaterialPoints, Particles, Scene
 def faces_of(
     scene: Scene, particles: Particles, potential: ElasticPotential, t: Scalar, dt: Scalar, force_at: Scalar | None
 ) -> Faces:
-    """The faces of prepared particles.
-
-    Args:
-        scene: the scene.
-        particles: prepared particles.
-        potential: their elastic potential.
-        t: time at the start of the step [s].
-        dt: step [s].
-        force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
-    """
+    """The faces of prepared particles in a step from t. Forces are evaluated at the share `force_at` of the step's
+    displacement; None if the step is explicit."""
     materials, shapes, areas, explicit = potential.material_points, [], [], force_at is None
     factor = EXPLICIT_STIFFNESS if explicit else IMPLICIT_STIFFNESS
     for law, points in zip(scene.laws, materials, strict=True):
@@ -67,17 +59,7 @@ def contacts_of_bodies(
     dt: Scalar,
     force_at: Scalar | None,
 ) -> list[BodyContact]:
-    """The contacts of each two bodies of a scene with `bodies`.
-
-    Args:
-        scene: the scene.
-        friction: the bodies' coefficient of friction [-].
-        particles: prepared particles.
-        potential: their elastic potential.
-        images: the mirrors of symmetry planes, beyond which bodies go on.
-        dt: step [s].
-        force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
-    """
+    """The contacts of each two bodies of a scene with `bodies`, which go on beyond symmetry planes (see `faces_of`)."""
     bodies = _bodies(scene, particles, potential, images)
     at = jnp.ones(()) if force_at is None else jnp.asarray(force_at)
     return [

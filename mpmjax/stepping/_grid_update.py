@@ -15,44 +15,31 @@ from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion, advance
 from mpmjax.stepping._nodes import Nodes
 
 
-class ContactUpdate(eqx.Module):
-    """The active set of contact, and friction."""
-
-    held: ConstrainedNodes
-    """The nodes with the active set held."""
-    solved: NodeMotion
-    """The motion of the nodes before friction."""
-    friction: tuple[NodeVector, ...]
-    """The change of velocity by the friction of each contact [m/s], shape (n, d)."""
-    info: ContactInfo
-
-
 class GridUpdate(eqx.Module):
     """The motion of the nodes over a step, mirrored at active contact planes."""
 
     motion: NodeMotion
+    solved: NodeMotion
+    """`motion` before friction."""
     elastic: NodeVector | None
     """The impulse of elastic forces (see `AbstractIntegrator.elastic_impulse`) [kg m/s], shape (n, d); None if P2G
     summed momentum and force together."""
     solve: SolveInfo
-    contact: ContactUpdate | None = None
-    """None in a scene without contact."""
-
-    @property
-    def solved(self) -> NodeMotion:
-        """`motion` before friction."""
-        return self.motion if self.contact is None else self.contact.solved
+    constrained: ConstrainedNodes | None = None
+    """The nodes with the active set held; None in a scene without contact."""
+    friction: tuple[NodeVector, ...] = ()
+    """The change of velocity by the friction of each contact [m/s], shape (n, d)."""
+    contact: ContactInfo | None = None
 
     def held(self, nodes: Nodes) -> ConstrainedNodes:
         """The nodes with what contacts hold."""
-        return constrain(nodes, ()) if self.contact is None else self.contact.held
+        return constrain(nodes, ()) if self.constrained is None else self.constrained
 
     def before(self, nodes: Nodes) -> NodeVector:
         """v_i^n with the prescribed values where boundaries and contacts hold [m/s], shape (n, d)."""
-        if self.contact is None:
+        if self.constrained is None:
             return nodes.admitted_velocity()
-        held = self.contact.held
-        return held.images.unfold(held.nodes.admitted_velocity())
+        return self.constrained.images.unfold(self.constrained.nodes.admitted_velocity())
 
 
 class StageFriction(eqx.Module):
@@ -112,12 +99,8 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     holding = held.without_spring_impulses(reaction(nodes, solved, elastic))
     velocity, friction = held.friction(solved.velocity, holding)
     contact = ContactInfo(sweeps, count_places(nodes, *held.violations(solved.velocity, holding)))
-    return GridUpdate(
-        motion.with_friction(velocity - motion.velocity, method.share_in_mean()),
-        elastic,
-        cost.followed_by(info),
-        ContactUpdate(held, solved, friction, contact),
-    )
+    motion = motion.with_friction(velocity - motion.velocity, method.share_in_mean())
+    return GridUpdate(motion, solved, elastic, cost.followed_by(info), held, friction, contact)
 
 
 def elastic_impulse(nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion) -> NodeVector | None:

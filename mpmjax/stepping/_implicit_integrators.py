@@ -60,7 +60,7 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         return self.solution  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
-    def linearises(self) -> bool:
+    def linearises(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether stages have the elastic force f(0) − H u in place of that of the law."""
         return getattr(self.solved_by(), "linearises", False)
 
@@ -99,7 +99,7 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             potential=nodes.potential,
             hessian=self.hessian,
             projection=nodes.projection,
-            prescribed=nodes.prescribed if nodes.moves_held else None,
+            prescribed=nodes.prescribed if nodes.conditions.moves or nodes.potential.mirror.moving else None,
             preconditioner=self.preconditioner,
             theta=theta,
         )
@@ -109,6 +109,10 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt Σ q f(u) [kg m/s], with the forces that the solution takes."""
         return self.impulse_of(nodes, self.stages(nodes, motion))
+
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt Σ q f(u) [kg m/s], with the forces of the law."""
+        return self.impulse_of(nodes, self.stages(nodes, motion), exact=True)
 
     def impulse_of(
         self, nodes: Nodes, stages: tuple[tuple[Scalar, NodeVector | None], ...], *, exact: bool = False
@@ -120,9 +124,6 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         forces = (q * (nodes.force if u is None else nodes.potential.force(u)) for q, u in stages)
         return nodes.dt * reduce(jnp.add, forces)
 
-    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
-        return self.impulse_of(nodes, self.stages(nodes, motion), exact=True) if self.linearises else None
-
     def mean_displacement(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Σ q u [m] of the stages."""
         return _mean(self.stages(nodes, motion))
@@ -131,7 +132,13 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         return 0.0
 
     def initial_guess(self, nodes: Nodes) -> NodeVector:
-        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
+        match self.guess:
+            case Guess.GRID_VELOCITY:
+                return nodes.velocity
+            case Guess.EXPLICIT:
+                return nodes.explicit_velocity()
+            case Guess.ZERO:
+                return jnp.zeros_like(nodes.velocity)
 
     def reporting(self, slot: Scalar) -> "AbstractImplicitIntegrator":
         return eqx.tree_at(lambda m: m.adjoint_solver, self, Reporting(self.adjoint_solver, slot))
@@ -164,6 +171,7 @@ class SemiImplicit(AbstractImplicitIntegrator):
         hessian, preconditioner, adjoint_solver, guess: see `AbstractImplicitIntegrator`.
     """
 
+    linearises: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
     beta: Scalar = 1.0
     solver: lx.AbstractLinearSolver = ConjugateResidual()
 
@@ -171,10 +179,6 @@ class SemiImplicit(AbstractImplicitIntegrator):
         require_fields(self)
         require_solver("SemiImplicit's solver", self.solver)
         require_between("SemiImplicit's beta", self.beta, 0, 1)
-
-    @property
-    def linearises(self) -> bool:
-        return True
 
     def solved_by(self) -> Callable[[StageProblem, NodeVector], tuple[NodeVector, SolveInfo]]:
         return eqx.Partial(solve_linearised, self.solver)

@@ -58,6 +58,8 @@ class AbstractIntegrator(eqx.Module):
     explicit_viscosity: ClassVar[bool] = True
     """Whether `nodes.force` includes the viscous stress, at the particles' stored velocity gradients. If False,
     `advance` must treat viscosity and return the velocity in its force as `NodeMotion.resisted`."""
+    linearises: ClassVar[bool] = False
+    """Whether the elastic force that moves the nodes is f(0) − H u, and not that of the law."""
     body_force_at: ClassVar[float] = 0.0
     """The time at which body forces are evaluated, as a fraction of the step: 0 at its start, ½ in its middle."""
     keeps_admissible: ClassVar[bool] = False
@@ -83,10 +85,10 @@ class AbstractIntegrator(eqx.Module):
         elsewhere, from `NodeMotion.resisted`.
         """
 
-    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
-        """`elastic_impulse` with the forces of the law, where it has others; None where it has those. Default: None."""
-        del nodes, motion
-        return None
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """`elastic_impulse` with the forces of the law. Default: `elastic_impulse`. It is asked of one that
+        `linearises`."""
+        return self.elastic_impulse(nodes, motion)
 
     def stability_factor(self) -> Scalar | None:
         """The number c for which a step is stable if c (Δt² Λ A/ρ0 + Δt Λ_v B/ρ0) ≤ 4 (see `stable_dt`). It is 1 for
@@ -157,7 +159,9 @@ class Explicit(AbstractIntegrator):
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         del guess
-        v = nodes.admitted(nodes.explicit_velocity())
+        v = nodes.explicit_velocity()
+        if nodes.conditions.holds:
+            v = nodes.projection.combine(v, nodes.prescribed)
         return NodeMotion(v), no_solve(v.dtype)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:

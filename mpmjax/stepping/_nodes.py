@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
+from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
 from mpmjax.boundary import (
     AbstractContact,
@@ -19,7 +20,7 @@ from mpmjax.boundary import (
 )
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
-from mpmjax.potential import AbstractTerm, Mirror
+from mpmjax.potential import AbstractTerm, Forces, Mirror
 from mpmjax.state import Particles, Scene, load_force, points_of, terms_of
 from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
 from mpmjax.stepping._rigid_layers import rigid_layers
@@ -107,14 +108,9 @@ class Nodes(AbstractNodes):
         return Projection(self.free, tuple(part.direction for part in self.free_normals))
 
     @property
-    def moves_held(self) -> bool:
-        """Whether held components may have another velocity than zero."""
-        return self.conditions.moves or bool(self.mirror.moving)
-
-    @property
     def prescribed(self) -> NodeVector:
         """The velocity of held components [m/s], shape (n, d)."""
-        parts, velocity = self.free_normals, self.mirror.with_motion(self.conditions.velocity)
+        parts, velocity = self.free_normals, self.potential.mirror.with_motion(self.conditions.velocity)
         if not parts:
             return velocity
         along = reduce(jnp.add, (part.direction * part.speed[:, None] for part in parts))
@@ -128,13 +124,9 @@ class Nodes(AbstractNodes):
         """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
         return self.v if self.f is None else self.inertial_velocity() + self.dt * self.per_mass(self.f)
 
-    def admitted(self, velocity: NodeVector) -> NodeVector:
-        """A velocity that is zero on empty nodes, with the prescribed values in held components [m/s], shape (n, d)."""
-        return self.projection.combine(velocity, self.prescribed) if self.conditions.holds else velocity
-
     def admitted_velocity(self) -> NodeVector:
         """v^n with the prescribed values in held components [m/s], shape (n, d)."""
-        return self.admitted(self.velocity)
+        return self.projection.combine(self.velocity, self.prescribed) if self.conditions.holds else self.velocity
 
     def per_mass(self, impulse: NodeVector) -> NodeVector:
         """An impulse or force divided by the nodes' mass; zero on empty nodes."""
@@ -197,8 +189,6 @@ def particles_to_grid(
     """P2G: mass, velocity and force of the nodes in the step from t to t + dt, and the elastic potential.
 
     Args:
-        scene, particles, stencil: the scene, its prepared particles and their stencil.
-        t, dt: time at the start of the step, and its length [s].
         body_force_at: the time at which body forces are evaluated, as a fraction of the step. Positions are moved on to
             it with the particles' velocity.
         explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
@@ -208,7 +198,7 @@ def particles_to_grid(
     C = None if particles.C is None else components(particles.C)
     joined = joined and (stencil.is_least_squares or not scene.transfer.affine) and not scene.rigid_bodies
     potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), size)
-    flux = potential.current_weighted_stress()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
+    flux = potential.weighted_stress()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
     if explicit_viscosity and C is not None and potential.material_viscous:
         flux = flux + potential.weighted_viscous_stress(C)
     gravity, body_force = jnp.asarray(scene.gravity), None
@@ -222,7 +212,7 @@ def particles_to_grid(
     nodes = Nodes(
         mass=mass,
         v=v,
-        f=None if joined else -potential.nodal_sum(flux),
+        f=None if joined else potential.on_nodes([Forces(slopes=-la.transpose(flux))]),
         g=None if joined else gravity,
         dt=jnp.asarray(dt),
         spacing=jnp.asarray(scene.grid.spacing),
@@ -249,7 +239,7 @@ def _with_loads(
     nodes = replace(nodes, potential=potential)
     force = load_force(scene.loads, points, t, nodes.dt, at, potential.size)
     nodes = nodes if force is None else nodes.accelerated(force)
-    return nodes.pushed(potential.unfolded(forces)) if forces else nodes
+    return nodes.pushed(potential.on_nodes(forces)) if forces else nodes
 
 
 def with_boundaries(
@@ -286,11 +276,10 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar
     """The nodes, folded at the scene's symmetry planes, and those of rigid bodies to the two that move each."""
     images = mirror(scene.boundary, scene.grid, scene.window(particles), t, nodes.dt)
     if scene.rigid_bodies:
-        rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
+        rigid, of_bodies, v, conditions = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
         loose = nodes.folded(images)
-        nodes = loose.folded(Mirror(rigid.images))
-        v = jnp.where(rigid.of_bodies, rigid.velocity, nodes.velocity)
-        return replace(nodes, v=v, conditions=rigid.conditions, loose=loose)
+        nodes = loose.folded(rigid)
+        return replace(nodes, v=jnp.where(of_bodies, v, nodes.velocity), conditions=conditions, loose=loose)
     if not images.moving:
         return nodes.folded(images)
     # at rest with the mirrors: the velocity less what they add, which is put back

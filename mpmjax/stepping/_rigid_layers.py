@@ -2,33 +2,20 @@
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import Conditions
 from mpmjax.geometry import RigidBody, rigid_body, rotation_of, rotation_of_chords, spinning, turn
 from mpmjax.potential import Image, Mirror, RigidImage
 from mpmjax.state import Particles, RigidMaterial, Scene
 
 
-class RigidLayers(eqx.Module):
-    """The nodes that those of rigid bodies are folded to: two nodes of each layer, the first with the velocity V and
-    the second s = Gω (see `RigidImage`)."""
-
-    images: tuple[RigidImage, ...]
-    of_bodies: Bool[Array, "n 1"]
-    """The nodes of rigid bodies, shape (n, 1)."""
-    velocity: NodeVector
-    """Their velocity at the start of the step [m/s], shape (n, d), zero elsewhere."""
-    conditions: Conditions
-    """The conditions on all nodes: for rigid bodies, on these two."""
-
-
 def rigid_layers(
     scene: Scene, particles: Particles, mass: NodeScalar, conditions: Conditions, planes: Mirror, dt: Scalar
-) -> RigidLayers:
-    """The rigid bodies of a scene.
+) -> tuple[Mirror, Bool[Array, "n 1"], NodeVector, Conditions]:
+    """The rigid bodies of a scene, whose nodes are folded to two of each layer, the first with the velocity V and the
+    second with s = Gω (see `RigidImage`).
 
     Args:
         scene: the scene.
@@ -37,6 +24,10 @@ def rigid_layers(
         conditions: what boundaries prescribe of all nodes.
         planes: the mirrors of symmetry planes.
         dt: step [s].
+
+    Returns:
+        the maps; the nodes of rigid bodies, shape (n, 1); their velocity at the start of the step [m/s], shape (n, d),
+        zero elsewhere; and the conditions on all nodes, those of rigid bodies on these two.
     """
     places = scene.nodes(particles, 0.0)  # at any time: planes beside rigid bodies rest
     of_bodies, velocity = jnp.zeros((len(mass), 1), bool), jnp.zeros_like(places)
@@ -50,7 +41,7 @@ def rigid_layers(
         velocity = image.with_own(velocity, _first_two(image, body.velocity, body.root() @ body.spin))
         fixed = image.with_own(fixed, jnp.zeros(image.arms.shape, bool).at[:2].set(held))
         prescribed = image.with_own(prescribed, jnp.zeros_like(image.arms).at[:2].set(jnp.where(held, value, 0)))
-    return RigidLayers(tuple(images), of_bodies, velocity, Conditions(fixed, prescribed, conditions.colliders))
+    return Mirror(tuple(images)), of_bodies, velocity, Conditions(fixed, prescribed, conditions.colliders)
 
 
 def moved_rigidly(
@@ -68,25 +59,18 @@ def moved_rigidly(
         c ← c + Δt V̄,    x_p ← c + R (x_p − c),    v_p ← V + ω × (x_p − c),    F_p ← R F_p,
 
     where R is the rotation at the mean angular momentum I ω̄, and the spin at the end has the angular momentum after the
-    step; of a body whose spin is prescribed, R is the rotation by Δt ω̄ and the spin is that.
-
-    Args:
-        scene: the scene.
-        before: the particles at the start of the step.
-        after: those after G2P.
-        mirror: the mirrors of the nodes.
-        fixed: the components of the nodes' velocity that are prescribed, shape (n, d).
-        new: velocity of the nodes after the step [m/s], shape (n, d), folded.
-        mean: the velocity with which positions move [m/s], likewise.
-        dt: step [s].
+    step; of a body whose spin is prescribed, R is the rotation by Δt ω̄ and the spin is that. The nodes' velocities,
+    after the step and that with which positions move, are folded.
     """
     x, v, C, deformations = after.x, after.v, after.C, list(after.deformations)
     for material, image in zip(scene.rigid_bodies, mirror.rigid, strict=True):
         rows, body = slice(*before.groups[material.number].rows), _body(before, material)
         end, over = image.own(new), image.own(mean)
         R = rotation_of(body, body.inertia @ image.spin(over[1]), dt)
-        spin = _spin_after(body, R, body.inertia @ image.spin(end[1]))
-        if before.dim == 3:  # else the two are the same
+        momentum = body.inertia @ image.spin(end[1])
+        spin = momentum / body.inertia.diagonal()
+        if before.dim == 3:  # else the inertia does not turn, and what is held is the same
+            spin = R @ jnp.linalg.solve(body.inertia, R.T @ momentum)  # (R I Rᵀ)⁻¹ L
             held, axes = image.own(fixed)[1].any(), jnp.eye(3, dtype=x.dtype)
             R = jnp.where(held, turn(axes, dt * image.spin(over[1])).T, R)
             spin = jnp.where(held, image.spin(end[1]), spin)
@@ -97,13 +81,6 @@ def moved_rigidly(
             C = C.at[rows].set(spinning(spin, jnp.eye(before.dim, dtype=x.dtype)).T)
         deformations[material.number] = R @ jnp.asarray(before.deformations[material.number])
     return replace(after, x=x, v=v, C=C, deformations=tuple(deformations))
-
-
-def _spin_after(body: RigidBody, R: Array, momentum: Array) -> Float[Array, "r"]:
-    """ω at the end of the step, (R I Rᵀ)⁻¹ L."""
-    if len(momentum) < 3:
-        return momentum / body.inertia.diagonal()
-    return R @ jnp.linalg.solve(body.inertia, R.T @ momentum)
 
 
 def _body(particles: Particles, material: RigidMaterial) -> RigidBody:

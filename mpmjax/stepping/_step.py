@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Int, NodeVector, Scalar, components, particle_first
 from mpmjax.autodiff import without_derivative
 from mpmjax.boundary import ContactInfo, Impulses
 from mpmjax.checks import canonical, checked, require_finite, require_placement, require_positive
 from mpmjax.discretisation import Stencil, g2p, scatter
 from mpmjax.implicit import SolveInfo
+from mpmjax.potential import Forces
 from mpmjax.state import Particles, Scene, State, is_prepared, prepare, with_state
 from mpmjax.stepping._boundary_forces import impulse_on_boundaries, impulse_on_colliders
 from mpmjax.stepping._grid_update import GridUpdate, constrained_update
@@ -94,7 +96,7 @@ def step_unchecked(
         boundaries = impulse_on_boundaries(scene, particles, t, unfolded, nodes, method, new)
     return after, StepInfo(
         solve=new.solve,
-        contact=ContactInfo(none, none) if new.contact is None else new.contact.info,
+        contact=ContactInfo(none, none) if new.contact is None else new.contact,
         outside=(~stencil.inside).sum().astype(jnp.int32),
         force_error=error,
         force_scale=scale,
@@ -112,7 +114,7 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     if nodes.contacts:
         return constrained_update(nodes, method)
     motion, info = advance(nodes, method, method.initial_guess(nodes))
-    return GridUpdate(motion, None if nodes.f is None else method.elastic_impulse(nodes, motion), info)
+    return GridUpdate(motion, motion, None if nodes.f is None else method.elastic_impulse(nodes, motion), info)
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
@@ -165,17 +167,16 @@ def force_error(
     maps. No derivative passes."""
     frozen = without_derivative((nodes, method, force_at, motion, elastic, trial, after))
     nodes, method, force_at, motion, elastic, trial, after = frozen
-    exact, mass = method.exact_impulse(nodes, motion), nodes.mass
-    yields = any(law.relaxes_stress for law in scene.laws)
-    if exact is None and not yields:
+    mass, yields = nodes.mass, any(law.relaxes_stress for law in scene.laws)
+    if not method.linearises and not yields:
         return jnp.zeros((), mass.dtype), jnp.zeros((), mass.dtype)
-    exact = elastic if exact is None else exact
+    exact = method.exact_impulse(nodes, motion) if method.linearises else elastic
     if yields:  # the solve's forces went the share θ of the way to the trial stress, the law's go to the returned one
         tried, returned = (
-            replace(nodes.potential, material_points=scene.material_points(q)).current_weighted_stress()
-            for q in (trial, after)
+            replace(nodes.potential, material_points=scene.material_points(q)).weighted_stress() for q in (trial, after)
         )
-        exact = exact + force_at * nodes.dt * nodes.potential.nodal_sum(tried - returned)
+        relaxed = nodes.potential.on_nodes([Forces(slopes=la.transpose(tried - returned))])
+        exact = exact + force_at * nodes.dt * relaxed
         # what slows flow counts however small it is beside the momentum of what flows, but for its rounding
         mass = jnp.finfo(mass.dtype).eps ** 0.5 * mass
         stays = np.repeat([not law.relaxes_stress for law in scene.laws], trial.sizes)
