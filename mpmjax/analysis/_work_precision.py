@@ -45,18 +45,18 @@ class WorkPrecision(NamedTuple):
         reference. An explicit step beyond the limit is never good enough.
         """
         trials = [t for t in self.trials if not (t.method.is_explicit and t.dt * t.refinement > self.limit)]
-        errors = [max(t.error, self._next(t).error, self.reference.error) for t in trials]
+
+        def at_next(trial: Trial) -> float:  # the error at the next smaller step that was tried
+            same = trial.refinement, name_of(trial.method)
+            tried = [t for t in self.trials if (t.refinement, name_of(t.method)) == same]
+            finer = [t for t in tried if t.dt < trial.dt and not math.isnan(t.error)]
+            return max(finer, key=lambda t: t.dt, default=trial).error
+
+        errors = [max(t.error, at_next(t), self.reference.error) for t in trials]
         enough = max(self.target, 1.25 * min((e for e in errors if e >= 0), default=math.inf))
         good = [t for t, e in zip(trials, errors, strict=True) if e <= enough < math.inf]
         good = [t for t in good if explicit in (None, t.method.is_explicit)]
         return min(good, key=lambda trial: trial.seconds, default=None)
-
-    def _next(self, trial: Trial) -> Trial:
-        """The trial with the next smaller step, or the trial itself."""
-        same = (trial.refinement, name_of(trial.method))
-        tried = [t for t in self.trials if (t.refinement, name_of(t.method)) == same]
-        finer = [t for t in tried if t.dt < trial.dt and not math.isnan(t.error)]
-        return max(finer, key=lambda t: t.dt, default=trial)
 
     def verdict(self) -> str:
         """The cheapest setting in words, with the cost of the other kind of method, explicit or implicit."""

@@ -56,8 +56,8 @@ class SceneFile(NamedTuple):
     scene: Scene
     particles: Particles
     run: RunSettings
-    fit: dict[str, Any] | None  # the `[fit]` table, not read yet; None without one
-    build: Build  # makes the scene and its particles on n times as many cells a direction, from n
+    fit: dict[str, Any] | None
+    build: Build
 
 
 class Simulation(NamedTuple):
@@ -75,13 +75,15 @@ class Simulation(NamedTuple):
 
 
 def read_scene_file(path: Path) -> SceneFile:
-    """Read a scene file.
-
-    Raises:
-        ValueError: no such file, no TOML, a key that is unknown, missing or unfit, particles outside of the window: one
-            line that names the place.
-    """
-    table = _toml(path)
+    """Read a scene file; a ValueError says in one line which key is unknown, missing or unfit, and where."""
+    try:
+        table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"Cannot read the scene file {path}: {reason(error).lower()}.") from None
+    except RecursionError:
+        raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
+    except ValueError as error:  # TOML's and UTF-8's among them
+        raise ValueError(f"{path} is not a TOML file: {shortened(str(error))}.") from None
     for name in ("particles", "run"):
         require(name in table, f"{path}: needs the table [{name}]. See docs/scene_files.md.")
     fit_table = table.pop("fit", None)
@@ -89,7 +91,14 @@ def read_scene_file(path: Path) -> SceneFile:
     groups, run_table = table.pop("particles"), table.pop("run")
     groups = groups if isinstance(groups, list) else [groups]
     try:
-        run = _run_settings(run_table)
+        require(isinstance(run_table, dict), f"[run] must be a table, got {shortened(repr(run_table))}.")
+        auto = {name for name in ("dt", "method") if run_table.get(name) == "auto"}
+        require("dt" in run_table, '[run] needs the key \'dt\': a step in seconds, "stable" or "auto".')
+        both = '[run] method = "auto" goes with dt = "auto": the cheapest of both is chosen together.'
+        require(auto != {"method"}, both)
+        settings: dict[str, Any] = {} if "method" in auto else {"method": Explicit()}
+        settings |= arguments(RunSettings, {k: v for k, v in run_table.items() if k not in auto}, "[run]")
+        run = RunSettings(**settings)
 
         def build(n: int) -> tuple[Scene, Particles]:
             scene = decode(_refined(table, n), Scene)
@@ -114,17 +123,8 @@ def read_simulation(
     progress: Callable[[Trial], None] = lambda trial: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Simulation:
-    """Read a scene file, and resolve its "stable" step or what it leaves to pilot runs by "auto".
-
-    Args:
-        path: the file.
-        most_seconds: what the pilot runs may take [s]. Default: what the file says.
-        progress: called with each pilot run, see `work_precision`.
-        say: called with each run of their reference.
-
-    Raises:
-        ValueError: as `read_scene_file`, and as `stable_dt` and `work_precision`.
-    """
+    """Read a scene file, and resolve its "stable" step or what it leaves to pilot runs by "auto", within
+    `most_seconds` or what the file says. `progress` and `say` are those of `work_precision`."""
     file = read_scene_file(path)
     run, choice = file.run, None
     t1, dt, method, save_every = run.t1, run.dt, run.method, run.save_every
@@ -164,28 +164,6 @@ def stable_step(path: Path, file: SceneFile) -> float:
         return float(stable_dt(file.scene, file.particles, method=file.run.method, t1=file.run.t1))
     except ValueError as error:
         raise ValueError(f'{path}: [run] dt = "stable": {error}') from None
-
-
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"Cannot read the scene file {path}: {reason(error).lower()}.") from None
-    except RecursionError:
-        raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
-    except ValueError as error:  # TOML's and UTF-8's among them
-        raise ValueError(f"{path} is not a TOML file: {shortened(str(error))}.") from None
-
-
-def _run_settings(table: Any) -> RunSettings:
-    require(isinstance(table, dict), f"[run] must be a table, got {shortened(repr(table))}.")
-    left = {name for name in ("dt", "method") if table.get(name) == "auto"}
-    require("dt" in table, '[run] needs the key \'dt\': a step in seconds, "stable" or "auto".')
-    require(left != {"method"}, '[run] method = "auto" goes with dt = "auto": the cheapest of both is chosen together.')
-    settings = arguments(RunSettings, {key: value for key, value in table.items() if key not in left}, "[run]")
-    if "method" not in left:
-        settings.setdefault("method", Explicit())
-    return RunSettings(**settings)
 
 
 def _refined(table: dict[str, Any], n: int) -> dict[str, Any]:

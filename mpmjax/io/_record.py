@@ -6,9 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
-import diffrax
-import jax.numpy as jnp
-import numpy as np
 from tqdm import tqdm
 
 from mpmjax._types import Scalar
@@ -21,14 +18,14 @@ from mpmjax.simulation import (
     Run,
     RunStatistics,
     SimulationError,
-    before_fault,
     initial_state,
-    integrate,
     number_of_steps,
     raise_faults,
+    run_to,
+    segment,
     warn_of_inaccuracy,
 )
-from mpmjax.state import Particles, Scene, prepare, state_of, with_state
+from mpmjax.state import Particles, Scene, prepare, state_of
 from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
 
 
@@ -110,45 +107,13 @@ def record(
             before: Callable[[], RolloutState] = partial(initial_state, scene, particles)
             while healthy and step < end:
                 count = min(save_every - (step - start) % save_every, end - step)
-                begin = state
-                go = partial(
-                    integrate,
-                    scene,
-                    particles,
-                    begin,
-                    jnp.asarray(step, dtype),
-                    jnp.asarray(count, dtype),
-                    dt_,
-                    method,
-                    until=np.asarray(np.inf, dtype),
-                    max_steps=save_every,
-                    save_every=None,
-                    observe=None,
-                    adjoint=diffrax.ForwardMode(),  # the plain loop
-                    progress=False,
-                    watch=True,
-                )
-                reached = go()
-                state, new = reached.state, reached.statistics
-                before = partial(before_fault, go, begin, new)
+                state, new, before = segment(scene, particles, state, step, count, dt_, method, max_steps=save_every)
                 statistics, step = statistics.merged(new), step + int(new.steps)
                 healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
                 if healthy:
                     append(step, state, statistics)
                     bar.update(count)
-        run = Run(
-            scene=scene,
-            method=method,
-            dt=dt_,
-            steps=jnp.zeros((0,), dtype),
-            frames=None,
-            observed=None,
-            final=with_state(particles, state.particles),
-            final_step=jnp.asarray(step, dtype),
-            statistics=statistics,
-            final_collider_impulse=state.collider_impulse,
-            final_boundary_impulse=state.boundary_impulse,
-        )
+        run = run_to(state, step, statistics, scene, particles, dt_, method)
         try:
             raise_faults(run, particles, before, start)
         except SimulationError as error:

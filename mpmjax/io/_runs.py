@@ -1,6 +1,6 @@
 """Runs in files: HDF5 that ParaView opens as it is, and from which a run continues bit for bit.
 
-    /VTKHDF     the frames (see `_run_contents`): Points, and as PointData velocity, deformation_gradient, J = det F,
+    /VTKHDF     the frames (see `_run_file`): Points, and as PointData velocity, deformation_gradient, J = det F,
                 with APIC affine_velocity, and what laws that yield remember
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
                 `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
@@ -22,42 +22,35 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax.boundary import Impulses
 from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_memory, require_positive
-from mpmjax.io._hdf5 import (
-    LIBVER_HEAD,
+from mpmjax.io._run_file import (
     File,
     check_hdf5,
     check_no_writer,
     check_place,
+    check_same,
     checksum,
     count_in,
+    created,
+    describe,
+    description_in,
     frame_rows,
     opened,
     reading,
     require_of_file,
-    set_count,
-)
-from mpmjax.io._run_contents import (
-    add_growing,
-    add_topology,
-    check_readable,
-    check_same,
-    describe,
-    description_in,
     rows_of,
+    set_count,
     states_in,
-    write_description,
 )
 from mpmjax.io._schema import decode
 from mpmjax.io._transactional_file import StagedFile, reason, replacing, staged_file, undisturbed
-from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, no_steps
-from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
+from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, no_steps, run_to
+from mpmjax.state import Particles, Scene, State, prepare, state_of
 from mpmjax.stepping import AbstractIntegrator
 
 _IMPULSES = ("collider_impulse", "boundary_impulse")
@@ -83,14 +76,8 @@ class FrameWriter:
         start: int = 0,
         overwrite: bool = False,
     ) -> "FrameWriter":
-        """Begin a file with prepared particles as its first frame, of step `start`. It takes its place when that is on
-        the disk.
-
-        Raises:
-            ValueError: a file that is there, and with `overwrite` one that is no run or is being written; a place that
-                cannot be written; an object that files cannot hold.
-            OSError: the disk has no room for it; what was there is there.
-        """
+        """Begin a file with prepared particles as its first frame, of step `start`. It takes its place when that is
+        on the disk; whatever is wrong before leaves what was there."""
         path = Path(path)
         check_place(path, overwrite=overwrite)
         with undisturbed():
@@ -102,13 +89,8 @@ class FrameWriter:
     def resume(
         cls, path: str | os.PathLike, scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any
     ) -> "FrameWriter":
-        """Open a file to append frames to it, after checking that it is whole and of the same run. Frames that a killed
-        writer left incomplete are cut off.
-
-        Raises:
-            ValueError: see `load`; a file that is being written; a scene, particles, method or dt that differ from the
-                file's.
-        """
+        """Open a file to append frames to it, after checking that it is whole, of the same run, and not being
+        written. Frames that a killed writer left incomplete are cut off."""
         path = Path(path)
         described = describe(scene, particles, method, dt)
         begin = initial_state(scene, particles)
@@ -137,10 +119,7 @@ class FrameWriter:
 
     def append(self, step: int, state: RolloutState, statistics: RunStatistics) -> None:
         """Write the frame of a step, with impulses and statistics by then; one of the last frame's step replaces it.
-
-        Raises:
-            OSError: the disk refused. The file is what it was before, and this writer can only be closed.
-        """
+        If the disk refuses, an OSError: the file is what it was, and this writer can only be closed."""
         file, n = self._file, count_in(self._file)
         if n and file["mpmjax/frames"][n - 1]["step"] == step:
             n -= 1
@@ -206,17 +185,10 @@ class FrameWriter:
 @contextmanager
 def _new(path: Path, scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any) -> Iterator[FrameWriter]:
     """A writer of a new file, without frames, which is at `path` when the block has ended without an error."""
-    described = describe(scene, particles, method, dt)
-    check_readable(path, described)
-    begin = initial_state(scene, particles)
+    described, begin = describe(scene, particles, method, dt), initial_state(scene, particles)
+    rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
     with replacing(path) as aside, staged_file(aside) as staged:
-        h5py.File(staged, "w", libver=LIBVER_HEAD).close()
-        file = opened(staged, aside)
-        add_topology(file, particles.count)
-        file.create_group("mpmjax/arrays")
-        for name, data in _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype)).items():
-            add_growing(file, name, data)
-        write_description(file["mpmjax"], described)
+        file = created(staged, path, described, rows)
         file.flush()
         staged.commit()
         with FrameWriter(file, staged, aside, begin) as writer:
@@ -292,20 +264,18 @@ def load(path: str | os.PathLike) -> Run:
         steps, frames, tallies = _frames(file, like, 0, count_in(file))
         _check_numbers(scene, described["dt"], steps, frames.particles)
     last = jax.tree.map(lambda a: a[-1], frames)
-    return Run(
-        scene=scene,
-        method=method,
-        dt=jnp.asarray(described["dt"], dtype),
+    return run_to(
+        last,
+        steps[-1],
+        jax.tree.map(lambda a: a[-1], tallies),
+        scene,
+        particles,
+        jnp.asarray(described["dt"], dtype),
+        method,
         steps=jnp.asarray(steps, dtype),
         frames=frames.particles,
-        observed=None,
-        final=with_state(particles, last.particles),
-        final_step=jnp.asarray(steps[-1], dtype),
-        statistics=jax.tree.map(lambda a: a[-1], tallies),
         collider_impulse=frames.collider_impulse,
-        final_collider_impulse=last.collider_impulse,
         boundary_impulse=frames.boundary_impulse,
-        final_boundary_impulse=last.boundary_impulse,
     )
 
 

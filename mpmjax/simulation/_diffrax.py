@@ -105,13 +105,8 @@ class Problem(eqx.Module):
         return with_state(self.particles, state)
 
     def resorted(self, y: RolloutState, step: Array) -> "tuple[Problem, RolloutState]":
-        """The problem and the state before a step, their particles in the order of the state, which are sorted if it is
-        time to.
-
-        Args:
-            y: the state as the loop has it.
-            step: the number of steps since the rollout began.
-        """
+        """The problem and the state y before a step, `step` of them since the rollout began, their particles in the
+        order of the state, which are sorted if it is time to."""
         y = y.from_loop_layout(materialised)
         if y.order is None:
             return self, y
@@ -164,15 +159,6 @@ def _gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
 
 _GRAVEST_FIRST = (Fault.NOT_FINITE, Fault.PASSED, Fault.OUTSIDE, Fault.INADMISSIBLE, Fault.COLLAPSED)
 """The faults of a state, and of the step that led to it."""
-
-
-def _fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
-    """The gravest fault of a state, or of the step from t [s] that led to it."""
-    faults = faulty_particles(problem, after, t + problem.dt)
-    passed = [particles for _, particles in passed_particles(problem, before, after, t)]
-    if passed:
-        faults[Fault.PASSED] = reduce(jnp.logical_or, passed)
-    return _gravest({fault: faults[fault] for fault in _GRAVEST_FIRST if fault in faults})
 
 
 def examined(problem: Problem, state: RolloutState) -> tuple[Problem, RolloutState]:
@@ -228,7 +214,11 @@ class StepSolver(diffrax.AbstractSolver):
         report = report + info.solve.report
         y1 = y.after(particles, info)
         arrays, rest = eqx.partition((args, y.particles, y1.particles, t), eqx.is_array)
-        fault = _fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
+        constant, before, after, t = eqx.combine(jax.lax.stop_gradient(arrays), rest)
+        faults = faulty_particles(constant, after, t + constant.dt)
+        if passed := [particles for _, particles in passed_particles(constant, before, after, t)]:
+            faults[Fault.PASSED] = reduce(jnp.logical_or, passed)
+        fault = _gravest({fault: faults[fault] for fault in _GRAVEST_FIRST if fault in faults})
         statistics = statistics.merged(one_step(info, fault), solved=not args.method.is_explicit)
         y1 = y1.to_loop_layout()
         results: Any = diffrax.RESULTS  # whose members the type checker takes for another type
@@ -269,7 +259,7 @@ class SegmentAdjoint(diffrax.AbstractAdjoint):
         return self._loop(inner_while_loop=None, outer_while_loop=self._nested_loops, **of_diffrax)
 
     def _nested_loops(self, cond_fun: Any, body_fun: Any, state: Any, *, max_steps: int, buffers: Any) -> Any:
-        """The state after all steps, with the arguments of `equinox.internal.while_loop`."""
+        """As `equinox.internal.while_loop`."""
         del cond_fun, buffers
         turns = math.prod(self.lengths)
 
@@ -291,16 +281,10 @@ class SegmentAdjoint(diffrax.AbstractAdjoint):
 def checkpointed(
     steps: int, state_bytes: int, step_bytes: int, budget: int, *, stops: bool = False
 ) -> diffrax.AbstractAdjoint:
-    """The adjoint for reverse mode that computes steps again as seldom as a budget allows: by segments, in up to four
-    loops; with less memory diffrax's, whose checkpoints move.
-
-    Args:
-        steps: number of steps.
-        state_bytes: memory of a state [B].
-        step_bytes: memory of what is stored of a step at once, with the state that it starts from [B].
-        budget: memory for all of them [B].
-        stops: whether a fault may stop the run, which ends diffrax's loop alone.
-    """
+    """The adjoint for reverse mode that computes steps again as seldom as a `budget` of memory allows [B]: by
+    segments, in up to four loops; with less memory, or where a fault `stops` the run, diffrax's, whose checkpoints
+    move. A state takes `state_bytes`, what is stored of a step at once `step_bytes`, with the state that it starts
+    from."""
     for loops in () if stops else range(1, _MOST_LOOPS + 1):
         *outer, inner = _lengths(steps, loops)
         if sum(outer) * state_bytes + inner * step_bytes <= budget:

@@ -152,28 +152,27 @@ def simulate(
     )
     end = go()
     values, on_colliders, on_boundaries = end.saved
-    run = Run(
-        scene=scene,
-        method=method,
-        dt=dt_,
+    run = run_to(
+        end.state,
+        end.step,
+        end.statistics,
+        scene,
+        particles,
+        dt_,
+        method,
         steps=end.steps,
         frames=values if observe is None else None,
         observed=None if observe is None else values,
-        final=with_state(particles, end.state.particles),
-        final_step=end.step,
-        statistics=end.statistics,
         report=end.report if traced else None,
         collider_impulse=on_colliders,
-        final_collider_impulse=end.state.collider_impulse,
         boundary_impulse=on_boundaries,
-        final_boundary_impulse=end.state.boundary_impulse,
     )
     if not throw:
         return run
     if traced:
         return guarded(run, end.report)
     warn_of_rounding(scene.grid, run.final.x, particles.x)
-    raise_faults(run, particles, lambda: before_fault(go, begin, end.statistics), start)
+    raise_faults(run, particles, lambda: _before_fault(go, begin, end.statistics), start)
     warn_of_inaccuracy(run)
     return run
 
@@ -227,11 +226,8 @@ def _rollout(
 
 
 def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
-    """How many steps of dt lead from step `start` to time t1.
-
-    Raises:
-        ValueError: not a whole number, none, or more than the precision can count.
-    """
+    """How many steps of dt lead from step `start` to time t1; a ValueError if that is no whole number, none, or more
+    than the precision can count."""
     if is_traced((t1, dt)):
         raise ValueError("t1 and dt fix the number of steps and must be known numbers, not traced ones.")
     require_positive("dt [s]", dt, dtype)
@@ -284,11 +280,11 @@ def integrate(
     *,
     until: Scalar | Float[np.ndarray, ""],
     max_steps: int,
-    save_every: int | None,
-    observe: Callable[[Scene, Particles], Any] | None,
-    adjoint: diffrax.AbstractAdjoint,
-    progress: bool,
-    watch: bool,
+    save_every: int | None = None,
+    observe: Callable[[Scene, Particles], Any] | None = None,
+    adjoint: diffrax.AbstractAdjoint = diffrax.ForwardMode(),  # the plain loop
+    progress: bool = False,
+    watch: bool = True,
 ) -> End:
     """Integrate `count` ≤ `max_steps` steps from step `start`, at which the particles have this state.
 
@@ -337,8 +333,54 @@ def integrate(
     return End(steps, saved, final, start + statistics.steps.astype(start.dtype), statistics, report)
 
 
-def before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
+def _before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
     """The last good state of a run that met a fault, computed once more by the same program, `integrate` with all its
     arguments but `until`: no run carries it."""
     good = int(statistics.fault_step) - 1
     return begin if good == 0 else go(until=np.asarray(good, begin.particles.x.dtype)).state
+
+
+def segment(
+    scene: Scene,
+    particles: Particles,
+    begin: RolloutState,
+    step: int,
+    count: int,
+    dt: Scalar,
+    method: AbstractIntegrator,
+    *,
+    max_steps: int,
+) -> tuple[RolloutState, RunStatistics, Callable[[], RolloutState]]:
+    """The state after `count` ≤ `max_steps` steps from step `step`, their statistics, and a function that returns the
+    last good state. The arguments are canonical. Segments of all lengths are one compiled program."""
+    dtype = particles.x.dtype
+    first, number, until = jnp.asarray(step, dtype), jnp.asarray(count, dtype), np.asarray(np.inf, dtype)
+    go = partial(integrate, scene, particles, begin, first, number, dt, method, until=until, max_steps=max_steps)
+    end = go()
+    return end.state, end.statistics, partial(_before_fault, go, begin, end.statistics)
+
+
+def run_to(
+    state: RolloutState,
+    step: Any,
+    statistics: RunStatistics,
+    scene: Scene,
+    particles: Particles,
+    dt: Scalar,
+    method: AbstractIntegrator,
+    **saved: Any,
+) -> Run:
+    """The run that ended in this state at step `step`; `saved` are its fields that hold more than its end."""
+    dtype = particles.x.dtype
+    saved = {"steps": jnp.zeros((0,), dtype), "frames": None, "observed": None} | saved
+    return Run(
+        scene=scene,
+        method=method,
+        dt=dt,
+        final=with_state(particles, state.particles),
+        final_step=jnp.asarray(step, dtype),
+        statistics=statistics,
+        final_collider_impulse=state.collider_impulse,
+        final_boundary_impulse=state.boundary_impulse,
+        **saved,
+    )

@@ -202,14 +202,8 @@ def _cut_cells(region: AbstractRegion, size: np.ndarray) -> tuple[np.ndarray, np
     number = np.maximum(last - first, 1).astype(int)
     centres, volume = box_cells(first * size, (first + number) * size, size)
     share, centroid = inside_parts(region, centres, size)
-    share, centroid = _merged(share.reshape(number), centroid.reshape(*number, -1))
-    kept = share > 0
-    return centroid[kept], share[kept] * volume[kept.reshape(-1)]
-
-
-def _merged(share: np.ndarray, centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shares and centroids after parts smaller than `_SMALL` went to the neighbour, across a face, of the largest part.
-    A part without such a neighbour stays."""
+    share, centroid = share.reshape(number), centroid.reshape(*number, -1)
+    # parts smaller than `_SMALL` go to the neighbour, across a face, of the largest part; without one they stay
     small = (share > 0) & (share < _SMALL)
     padded = np.pad(share, 1)
     middle = (slice(1, -1),) * share.ndim
@@ -221,7 +215,8 @@ def _merged(share: np.ndarray, centroid: np.ndarray) -> tuple[np.ndarray, np.nda
     total, moment = np.where(small, 0, share), np.where(small[..., None], 0, share[..., None] * centroid)
     np.add.at(total, target, share[small])
     np.add.at(moment, target, share[small][:, None] * centroid[small])
-    return total, moment / np.where(total > 0, total, 1)[..., None]
+    kept = total > 0
+    return moment[kept] / total[kept][:, None], total[kept] * volume[kept.reshape(-1)]
 
 
 def _particles(x: np.ndarray, volume: np.ndarray, density: Scalar, velocity: Velocity, dtype: Any) -> Particles:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Float, NodeVector, ParticleVector, Point, Scalar
+from mpmjax._types import Array, Float, NodeVector, ParticleVector, Point, Scalar, components
 from mpmjax.checks import require, require_fields, require_that
 from mpmjax.discretisation import Stencil
 from mpmjax.geometry import (
@@ -24,7 +24,7 @@ from mpmjax.geometry import (
 )
 from mpmjax.material import AbstractLaw
 from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Forces
-from mpmjax.state._attachment import AbstractPlace, AttachedPoints, LoadedPoints, loaded_points
+from mpmjax.state._attachment import AbstractPlace, AttachedPoints, LoadedPoints, keeps_deformation
 from mpmjax.state._particles import Particles
 
 
@@ -275,9 +275,40 @@ def points_of(
     *,
     total: bool,
 ) -> tuple[LoadedPoints, ...]:
-    """The points of each load at the start of a step."""
-    places = [load.on for load in loads if isinstance(load.on, AttachedPoints)]  # `prepare` refuses others
-    return tuple(loaded_points(on, laws, particles, stencil, total=total) for on in places)
+    """The points of each load of prepared particles at the start of a step."""
+    dtype, F = particles.x.dtype, None
+    if any(keeps_deformation(law) for law in laws):
+        still, parts = jnp.eye(particles.dim, dtype=dtype), []  # the identity where a law does not keep it
+        for law, stored, count in zip(laws, particles.deformations, particles.sizes, strict=True):
+            whole = keeps_deformation(law) and stored is not None
+            parts.append(jnp.asarray(stored) if whole else jnp.broadcast_to(still, (count, *still.shape)))
+        F = jnp.concatenate(parts)
+
+    def at(on: AttachedPoints) -> LoadedPoints:
+        rows = jnp.asarray(on.particle, dtype).astype(jnp.int32)
+        offset = jnp.asarray(on.offset, dtype).T
+        deformation = None if F is None else components(F[rows])
+        arm = offset if deformation is None else la.matmul(deformation, offset[:, None])[:, 0]
+        r = offset if total else arm
+        v, rate = components(particles.v[rows]), None
+        if particles.C is not None:
+            C = components(particles.C[rows])
+            v = v + la.matmul(C, r[:, None])[:, 0]
+            rate = None if deformation is None else C if total else la.matmul(C, deformation)
+        return LoadedPoints(
+            x=components(particles.x[rows]) + arm,
+            v=v,
+            deformation=deformation,
+            rate=rate,
+            place=jnp.asarray(on.place, dtype).T,
+            weight=jnp.asarray(on.weight, dtype),
+            area=None if on.area is None else jnp.asarray(on.area, dtype).T,
+            arm=r,
+            stencil=stencil.of(rows),
+            particle=rows,
+        )
+
+    return tuple(at(load.on) for load in loads if isinstance(load.on, AttachedPoints))  # `prepare` refuses others
 
 
 def load_force(
