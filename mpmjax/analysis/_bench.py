@@ -68,10 +68,8 @@ def name_of(method: AbstractIntegrator) -> str:
 class Displacements(NamedTuple):
     """Initial positions of particles, and their displacements at the times of comparison."""
 
-    X: np.ndarray
-    """Initial positions [m], shape (p, d)."""
-    u: np.ndarray
-    """Displacements [m], shape (frames, p, d)."""
+    X: np.ndarray  # initial positions [m], shape (p, d)
+    u: np.ndarray  # displacements [m], shape (frames, p, d)
 
     @property
     def size(self) -> float:
@@ -88,10 +86,8 @@ class Displacements(NamedTuple):
 class Timed(NamedTuple):
     """The outcome of a run."""
 
-    states: list[State] | None
-    """The states at the times of comparison, None of a run that failed."""
-    linearisation_error: float
-    """Linearisation error of the steps [-]."""
+    states: list[State] | None  # the states at the times of comparison, None of a run that failed
+    linearisation_error: float  # linearisation error of the steps [-]
     seconds: float
 
 
@@ -190,8 +186,7 @@ class _RefinedRun(NamedTuple):
     steps: int
     seconds: float
     states: list[State] | None
-    motion: Displacements | None
-    """None if the run failed."""
+    motion: Displacements | None  # None if the run failed
     change: float
 
 
@@ -211,7 +206,26 @@ def settle(
         steps, method = 2 * FRAMES, TRBDF2()
     elif not clock.allows(2 * foreseen):
         raise ValueError(f"{steps} explicit steps take {foreseen:.2g} s and two runs are needed: {_more(seconds)}")
-    limit, good = _resolved_in_time(bench, method, steps, limit, error, clock, say)
+    good = None
+    while True:  # until the step resolves the motion, or the time is up
+        new, dt = _refined_run(bench, method, steps, good, say), bench.t1 / steps
+        if new.states is not None and new.motion is not None:
+            require(new.motion.size > 0, "Nothing moves in this scene, so there is no motion to be right or wrong.")
+            limit, good = min(limit, bench.limit(new.states)), new
+        allowed = clock.allows(2 * new.seconds)
+        if good is not None and (new.change <= error / 3 or dt <= limit * (1 + 1e-9) or not allowed):
+            break
+        if not allowed or (good is None and dt < limit / HOPELESS):
+            why = "It ended well."
+            try:
+                bench.timed(method, steps, FRAMES, steps // FRAMES, throw=True)
+            except SimulationError as fault:
+                why = str(fault)
+            raise ValueError(
+                f"The reference run, {name_of(method)} in {steps} steps ({new.seconds:.2g} s), fails, and half "
+                f"the step will not do or takes too long. {why}"
+            )
+        steps = max(2 * steps, bench.whole(limit) if method.is_explicit else 0)
     while growth * good.seconds < clock.left and (good.bench is bench or good.change > error / 3):
         finer = _refined_run(Bench.of(build, 2 * good.bench.refinement, bench.t1), method, 2 * good.steps, good, say)
         if finer.motion is None:
@@ -228,35 +242,6 @@ def settle(
     refinement, dt = good.bench.refinement, bench.t1 / good.steps
     trial = Trial(method, refinement, dt, good.steps, good.seconds, good.change)
     return limit, trial, good.motion
-
-
-def _resolved_in_time(
-    bench: Bench, method: AbstractIntegrator, steps: int, limit: float, error: float, clock: Clock, say: Say
-) -> tuple[float, _RefinedRun]:
-    """The explicit limit over the motion on the scene's own grid [s], and the run whose step resolves the motion, or
-    the last one within the time."""
-    good = None
-    while True:
-        new = _refined_run(bench, method, steps, good, say)
-        if new.states is not None and new.motion is not None:
-            require(new.motion.size > 0, "Nothing moves in this scene, so there is no motion to be right or wrong.")
-            limit, good = min(limit, bench.limit(new.states)), new
-        dt = bench.t1 / steps
-        hopeless = good is None and dt < limit / HOPELESS
-        enough = good is not None and (new.change <= error / 3 or dt <= limit * (1 + 1e-9))
-        if good is not None and (enough or not clock.allows(2 * new.seconds)):
-            return limit, good
-        if hopeless or not clock.allows(2 * new.seconds):
-            why = "It ended well."
-            try:
-                bench.timed(method, steps, FRAMES, steps // FRAMES, throw=True)
-            except SimulationError as fault:
-                why = str(fault)
-            raise ValueError(
-                f"The reference run, {name_of(method)} in {steps} steps ({new.seconds:.2g} s), fails, and half "
-                f"the step will not do or takes too long. {why}"
-            )
-        steps = max(2 * steps, bench.whole(limit) if method.is_explicit else 0)
 
 
 def _refined_run(

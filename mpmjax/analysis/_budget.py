@@ -14,14 +14,7 @@ from mpmjax.geometry import rigid_body
 from mpmjax.implicit import Projection
 from mpmjax.potential import Forces
 from mpmjax.state import Particles, Scene, prepare
-from mpmjax.stepping import (
-    AbstractIntegrator,
-    Explicit,
-    grid_to_particles,
-    reaction,
-    start_nodes,
-    update,
-)
+from mpmjax.stepping import AbstractIntegrator, Explicit, grid_to_particles, reaction, start_nodes, update
 
 
 class Energy(eqx.Module):

@@ -180,18 +180,16 @@ def work_precision(
                 note(bench, method, steps, 2 * trial.seconds, math.nan)
                 return
 
-    def bettered(method: AbstractIntegrator) -> bool:
-        """Whether others reach the errors of this implicit method on the scene's own grid in no more seconds."""
-        first = [t for t in trials if t.refinement == 1 and t.method.is_explicit == method.is_explicit]
-        finished = [t for t in first if t.method is method and math.isfinite(t.error)]
-        others = [t for t in first if t.method is not method]
-        return all(any(o.error <= _AS_GOOD * t.error and o.seconds <= t.seconds for o in others) for t in finished)
-
     benches = {1: bench}
     plan = [(n, method) for n, method in itertools.product(refinements, methods) if n <= reference.refinement or n == 1]
     for k, (n, method) in enumerate(plan):
-        if n > 1 and 1 in refinements and not method.is_explicit and bettered(method):
-            continue
+        if n > 1 and 1 in refinements and not method.is_explicit:
+            # whether others reach the errors of this method on the scene's own grid in no more seconds
+            first = [t for t in trials if t.refinement == 1 and not t.method.is_explicit]
+            finished = [t for t in first if t.method is method and math.isfinite(t.error)]
+            others = [t for t in first if t.method is not method]
+            if all(any(o.error <= _AS_GOOD * t.error and o.seconds <= t.seconds for o in others) for t in finished):
+                continue
         if clock.left <= 0:
             skipped.append(name_of(method) + (f" at spacing / {n}" if n > 1 else ""))
             continue

@@ -35,8 +35,7 @@ class Requirement(NamedTuple):
     """A requirement on values that are being traced."""
 
     message: str
-    met: Callable[[], Any]
-    """Computes bools that are all true if it is met."""
+    met: Callable[[], Any]  # computes bools that are all true if it is met
 
 
 _put_off: ContextVar[list[Requirement] | None] = ContextVar("_put_off", default=None)

@@ -222,7 +222,14 @@ def fit_command(
     begun = time.perf_counter()
     require(log is not None or not resume, "--resume continues the fit of a log: name it by --log.")
     asked = read_fit(scene, lambda file: _chosen(file, most_seconds))
-    grids = asked.refine if refine is None else _grids(refine)
+    grids = asked.refine
+    if refine is not None:
+        try:
+            numbers = tuple(int(part) for part in refine.split(","))
+        except ValueError:
+            text = shortened(refine, 20)
+            raise ValueError(f"--refine must be whole numbers with commas, such as 2, got {text!r}.") from None
+        grids = refinements(numbers, "--refine")
     if grids:
         asked.refined(grids[-1])  # a grid that cannot be is refused before the first fit
     plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
@@ -292,17 +299,6 @@ def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> Fit
 
     parameters = staged.result.restarted(asked.parameters)
     return asked._replace(parameters=parameters, experiments=until(asked.experiments), refined=refined)
-
-
-def _grids(text: str) -> tuple[int, ...]:
-    """The grids that --refine names."""
-    try:
-        numbers = tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(
-            f"--refine must be whole numbers with commas, such as 2, got {shortened(text, 20)!r}."
-        ) from None
-    return refinements(numbers, "--refine")
 
 
 @app.command("chart")

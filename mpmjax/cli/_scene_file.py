@@ -15,7 +15,6 @@ import numpy as np
 from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
 from mpmjax.checks import require, require_positive, shortened, warn
-from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractRegion
 from mpmjax.io import arguments, decode, reason
 from mpmjax.simulation import number_of_steps
@@ -190,6 +189,8 @@ def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
     filled: list[list[Particles]] = [[] for _ in scene.laws]
     regions: list[AbstractRegion] = []
     placed: list[np.ndarray] = []
+    grid, dx = scene.grid, float(scene.grid.spacing)
+    window, first, held = np.asarray(grid.shape) - 1, np.asarray(grid.origin) * dx, ~np.asarray(grid.periodic)
     for number, table in enumerate(tables, 1):
         where = f"[[particles]] {number}"
         require(isinstance(table, dict), f"{where} must be a table, got {shortened(repr(table))}.")
@@ -201,46 +202,33 @@ def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
             f"{shortened(repr(material))}.",
         )
         keys = arguments(fill, rest, where, without=("grid", "dtype"))
+        region: AbstractRegion = keys["region"]
         try:
-            _check_place(keys["region"], scene.grid)
-            filled[material - 1].append(fill(grid=scene.grid, dtype=dtype, **keys))
-            regions, placed = [*regions, keys["region"]], [*placed, np.asarray(filled[material - 1][-1].x)]
+            lower, upper = region.bounds()
+            if len(lower) == grid.dim:  # else `fill` refuses it
+                too_large = (upper - lower > (window + 2) * dx) & held
+                beside = ((upper < first) | (lower > first + window * dx)) & held & (not grid.follow)
+                require(
+                    ~(too_large | beside),
+                    f"the region from {lower} to {upper} m does not fit into the grid's window, of {window * dx} m"
+                    + ("" if grid.follow else f" from {first} m")
+                    + ": all lengths are in metres; enlarge the shape, move the origin, or use follow = true.",
+                )
+            filled[material - 1].append(fill(grid=grid, dtype=dtype, **keys))
+            regions, placed = [*regions, region], [*placed, np.asarray(filled[material - 1][-1].x)]
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
-    _warn_of_overlaps(regions, placed, float(scene.grid.spacing))
-    for number, sets in enumerate(filled, 1):
-        require(
-            len(sets) > 0, f"[[material]] {number} has no particles: name it in a [[particles]] table, or leave it out."
-        )
-    return join(*(replace(join(*sets), counts=None) for sets in filled))
-
-
-def _warn_of_overlaps(regions: list[AbstractRegion], placed: list[np.ndarray], spacing: float) -> None:
-    """Warn where particles of a table lie in the region of an earlier one, deeper than rounding has it."""
     for (i, region), (j, x) in itertools.product(enumerate(regions, 1), enumerate(placed, 1)):
         lower, upper = region.bounds()
         if i < j and ((x.min(axis=0) < upper) & (x.max(axis=0) > lower)).all():
-            inside = int(np.asarray(region.contains(jnp.asarray(x), -1e-3 * spacing)).sum())
+            inside = int(np.asarray(region.contains(jnp.asarray(x), -1e-3 * dx)).sum())  # deeper than rounding has it
             if inside:
                 warn(
                     f"{inside} particles of [[particles]] {j} lie in the region of [[particles]] {i}: where two fill "
                     "the same place there is twice the mass."
                 )
-
-
-def _check_place(region: AbstractRegion, grid: Grid) -> None:
-    """Refuse a region larger than the window or beside it, before it is filled."""
-    lower, upper = region.bounds()
-    if len(lower) != grid.dim:
-        return  # as `fill` says
-    dx, window = float(grid.spacing), np.asarray(grid.shape) - 1
-    first = np.asarray(grid.origin) * dx
-    held = ~np.asarray(grid.periodic)
-    too_large = (upper - lower > (window + 2) * dx) & held
-    beside = ((upper < first) | (lower > first + window * dx)) & held & (not grid.follow)
-    require(
-        ~(too_large | beside),
-        f"the region from {lower} to {upper} m does not fit into the grid's window, of {window * dx} m"
-        + ("" if grid.follow else f" from {first} m")
-        + ": all lengths are in metres; enlarge the shape, move the origin, or use follow = true.",
-    )
+    for number, sets in enumerate(filled, 1):
+        require(
+            len(sets) > 0, f"[[material]] {number} has no particles: name it in a [[particles]] table, or leave it out."
+        )
+    return join(*(replace(join(*sets), counts=None) for sets in filled))

@@ -9,7 +9,6 @@ dataset carries checksums, and a chunk holds one frame, so that writing a frame 
 """
 
 import json
-import math
 import struct
 import zlib
 from collections.abc import Iterator
@@ -24,14 +23,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax.checks import canonical, require
+from mpmjax.checks import canonical, require, require_finite, require_positive
 from mpmjax.io._schema import decode, encode
 from mpmjax.io._transactional_file import BUSY, StagedFile, reason, require_no_writer
 from mpmjax.state import Particles, Scene, State, by_material, history_arrays
 from mpmjax.stepping import AbstractIntegrator
 
-File = Any
-"""An `h5py.File`, whose own annotations do not say what a name leads to."""
+File = Any  # an `h5py.File`, whose own annotations do not say what a name leads to
 FORMAT = 9
 _LIBVER_HEAD = ("v108", "v108")
 _LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
@@ -172,7 +170,7 @@ def _check(path: Path, file: File) -> None:
             if not item.size:
                 continue
             chunk: tuple[int, ...] = item.chunks or (0,)
-            rows, size = chunk[0], item.dtype.itemsize * math.prod(chunk)
+            rows, size = chunk[0], item.dtype.itemsize * int(np.prod(chunk))
             require(rows and chunk[1:] == item.shape[1:], f"{name} does not lie in frames")
             least = size // _MOST_SHRUNK if item.compression else size
             stored: dict[int, int] = {}
@@ -229,8 +227,8 @@ def opened(staged: StagedFile, path: Path) -> File:
 
 
 def created(staged: StagedFile, path: Path, described: dict[str, Any], rows: dict[str, np.ndarray]) -> File:
-    """The staged file as that of a run which `describe` returned, without frames, each of which will be such rows; a
-    ValueError if `load` would not take it, since the run's dtype rounds a number to one that is not allowed."""
+    """The staged file as that of a run without frames, each of which will be such rows; a ValueError if `load` would
+    not take it, since the run's dtype rounds a number to one that is not allowed."""
     dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
     try:
         decode(described["scene"], Scene, "", arrays)
@@ -398,3 +396,24 @@ def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             yield from _flat(value, f"{path}.{key}".lstrip("."))
     else:
         yield path, data.item() if isinstance(data, np.generic) else data
+
+
+def steps_in(path: Path) -> int:
+    """How many steps led to the last frame of a file, −1 if that is not known. Raises what `load` does, and for a file
+    that is being written."""
+    check_no_writer(path)
+    with reading(path) as file:
+        require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+        return int(file["mpmjax/frames"][count_in(file) - 1]["steps"])
+
+
+def check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
+    """Check that the step is positive, step numbers grow, states are finite, and positions are ones that a grid can
+    number."""
+    require_positive("dt [s]", dt)
+    require(steps[0] >= 0 and (np.diff(steps) > 0).all(), f"A run's steps must grow from 0 or later, got {steps}.")
+    most = float(scene.grid.spacing) * 2**31  # as far as nodes are numbered
+    for state in states:
+        for leaf in jax.tree.leaves(state):
+            require_finite("A run's frames", leaf)
+        require(np.abs(state.x).max(initial=0) < most, f"Positions must be below {most:.3g} m.")

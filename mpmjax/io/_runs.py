@@ -15,23 +15,35 @@ A file is read only if it holds all of its data itself: HDF5 follows links to ot
 """
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
+from mpmjax._types import Scalar
 from mpmjax.boundary import Impulses
-from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_memory, require_positive
+from mpmjax.checks import (
+    canonical,
+    checked,
+    is_traced,
+    require,
+    require_memory,
+    require_whole,
+    requirements,
+)
 from mpmjax.io._run_file import (
     File,
     check_hdf5,
-    check_no_writer,
+    check_numbers,
     check_place,
     check_same,
     checksum,
@@ -48,10 +60,23 @@ from mpmjax.io._run_file import (
     states_in,
 )
 from mpmjax.io._schema import decode
-from mpmjax.io._transactional_file import StagedFile, reason, replacing, staged_file, undisturbed
-from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, no_steps, run_to
-from mpmjax.state import Particles, Scene, State, prepare, state_of
-from mpmjax.stepping import AbstractIntegrator
+from mpmjax.io._transactional_file import StagedFile, reason, replacing, reporting, staged_file, undisturbed
+from mpmjax.simulation import (
+    Fault,
+    RolloutState,
+    Run,
+    RunStatistics,
+    SimulationError,
+    initial_state,
+    no_steps,
+    number_of_steps,
+    raise_faults,
+    run_to,
+    segment,
+    warn_of_inaccuracy,
+)
+from mpmjax.state import Particles, Scene, prepare, state_of
+from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
 
 _IMPULSES = ("collider_impulse", "boundary_impulse")
 
@@ -196,6 +221,107 @@ def _new(path: Path, scene: Scene, particles: Particles, method: AbstractIntegra
 
 
 @checked
+def record(
+    path: str | os.PathLike,
+    scene: Scene,
+    particles: Particles,
+    *,
+    t1: Scalar,
+    dt: Scalar | Literal["stable"],
+    method: AbstractIntegrator = Explicit(),
+    save_every: int,
+    start: int = 0,
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: bool = False,
+) -> Run:
+    """Simulate as `simulate` does, writing each frame to a file when it is reached; memory holds one frame only.
+
+    The steps between two frames are one compiled program, called again and again, and give the same numbers as
+    `simulate` with the same `save_every`, bit for bit on a CPU. A run that is interrupted or meets a fault leaves a
+    whole file.
+
+    Args:
+        path: the file to be (see `save`).
+        scene: the scene.
+        particles: the particles at step `start`; when resuming, those the recorded run began with.
+        t1: end time [s], a whole number of steps after time zero.
+        dt: step [s], or "stable", as in `simulate`.
+        method: update of the grid velocity.
+        save_every: write a frame at the start, every so many steps, and at the end.
+        start: number of the first step. Not used when resuming.
+        overwrite: replace a file that is there.
+        resume: continue from the last frame in the file up to t1. Where that is reached already, nothing is done.
+        progress: show a progress bar on standard error.
+
+    Returns:
+        the run without its frames, which are in the file.
+
+    Raises:
+        ValueError: those of `simulate` and `load`; a file that is there, of another run, or being written.
+        SimulationError: those of `simulate`; the last good state is in the file.
+        OSError: the disk refused a frame, as when it is full. The file holds all frames before it and can be resumed.
+    """
+    start = 0 if resume else require_whole("start", start, 0)
+    requirements(method)
+    particles = prepare(scene, particles)
+    dt = step_for(scene, particles, t1, dt, method, start)
+    end = start + number_of_steps(t1, dt, start, particles.x.dtype)
+    save_every = min(require_whole("save_every", save_every, 1), end - start)
+    if resume:
+        writer = FrameWriter.resume(path, scene, particles, method, dt)
+    else:
+        writer = FrameWriter.create(path, scene, particles, method, dt, start=start, overwrite=overwrite)
+    scene, dt_, method = canonical((scene, dt, method), particles.x.dtype)
+    with writer:
+        step, state, statistics = writer.last()
+        start = step - int(statistics.steps)
+        require(
+            int(statistics.fault) == Fault.NONE,
+            f"{path} ends with a fault after step {step} and would meet it again: start anew with another dt or scene.",
+        )
+        bar = tqdm(initial=step, total=max(step, end), unit="step", file=sys.stderr, disable=not progress)
+
+        def stopped() -> str:
+            bar.close()
+            return writer.standing("Resume it to continue.")
+
+        def append(step: int, state: RolloutState, statistics: RunStatistics) -> None:
+            try:
+                writer.append(step, state, statistics)
+            except OSError as error:
+                raise OSError(f"{error}. {writer.standing('Make room, then resume it.')}") from None
+
+        with bar, reporting(stopped):
+            healthy = True
+            before: Callable[[], RolloutState] = partial(initial_state, scene, particles)
+            while healthy and step < end:
+                count = min(save_every - (step - start) % save_every, end - step)
+                state, new, before = segment(scene, particles, state, step, count, dt_, method, max_steps=save_every)
+                statistics, step = statistics.merged(new), step + int(new.steps)
+                healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
+                if healthy:
+                    append(step, state, statistics)
+                    bar.update(count)
+        run = run_to(state, step, statistics, scene, particles, dt_, method)
+        try:
+            raise_faults(run, particles, before, start)
+        except SimulationError as error:
+            good = error.run
+            last = RolloutState(state_of(good.final), good.final_collider_impulse, good.final_boundary_impulse)
+            try:
+                append(int(good.final_step), last, statistics)
+                resumable = int(statistics.fault) == Fault.NONE
+                again = "It can be resumed as it is." if resumable else "Resumed it would end there again: begin anew."
+                text = writer.standing(again)
+            except OSError as refused:
+                text = str(refused)
+            raise SimulationError(f"{error} {text}", good) from None
+        warn_of_inaccuracy(run)
+        return run
+
+
+@checked
 def save(path: str | os.PathLike, run: Run) -> None:
     """Save a run's frames (without frames, its final state as the one frame) with all that a restart needs.
 
@@ -215,7 +341,7 @@ def save(path: str | os.PathLike, run: Run) -> None:
     count = int((np.asarray(run.steps) < final_step).sum())  # beyond it lie frames of a run that met a fault
     steps, frames = jax.tree.map(lambda a: a[:count], (np.asarray(run.steps), run.frames))
     states = (state_of(run.final),) if frames is None else (frames, state_of(run.final))
-    _check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
+    check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
     unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.statistics)
     with _new(path, run.scene, run.final, run.method, run.dt) as writer:
         for i in range(count):
@@ -223,15 +349,6 @@ def save(path: str | os.PathLike, run: Run) -> None:
             writer.append(int(steps[i]), RolloutState(*frame), unknown)
         received = run.final_collider_impulse, run.final_boundary_impulse
         writer.append(final_step, RolloutState(state_of(run.final), *received), run.statistics)
-
-
-def steps_in(path: str | os.PathLike) -> int:
-    """How many steps led to the last frame of a file, −1 if that is not known. Raises what `load` does, and for a file
-    that is being written."""
-    check_no_writer(Path(path))
-    with reading(Path(path)) as file:
-        require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
-        return int(file["mpmjax/frames"][count_in(file) - 1]["steps"])
 
 
 @checked
@@ -256,13 +373,12 @@ def load(path: str | os.PathLike) -> Run:
         scene = decode(described["scene"], Scene, "scene", arrays)
         method = decode(described["method"], AbstractIntegrator, "method", arrays)
         scene, method = canonical((scene, method), dtype)
-        parts = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
-        parts_of_run: dict[str, Any] = parts
-        blank = jnp.zeros((len(parts_of_run["mass"]), scene.grid.dim), dtype)
-        particles = Particles(blank, blank, **parts_of_run, counts=described["counts"])
+        parts: dict[str, Any] = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
+        blank = jnp.zeros((len(parts["mass"]), scene.grid.dim), dtype)
+        particles = Particles(blank, blank, **parts, counts=described["counts"])
         like = jax.eval_shape(lambda: initial_state(scene, prepare(scene, particles)))
         steps, frames, tallies = _frames(file, like, 0, count_in(file))
-        _check_numbers(scene, described["dt"], steps, frames.particles)
+        check_numbers(scene, described["dt"], steps, frames.particles)
     last = jax.tree.map(lambda a: a[-1], frames)
     return run_to(
         last,
@@ -301,17 +417,4 @@ def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.n
         if getattr(like, name) is not None:
             both = jnp.asarray(rows[f"mpmjax/{name}"])
             received[name] = Impulses(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
-    kept = (received.get(name) for name in _IMPULSES)
-    return table["step"], RolloutState(states_in(rows, like.particles), *kept), tallies
-
-
-def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
-    """Check that the step is positive, step numbers grow, states are finite, and positions are ones that a grid can
-    number."""
-    require_positive("dt [s]", dt)
-    require(steps[0] >= 0 and (np.diff(steps) > 0).all(), f"A run's steps must grow from 0 or later, got {steps}.")
-    most = float(scene.grid.spacing) * 2**31  # as far as nodes are numbered
-    for state in states:
-        for leaf in jax.tree.leaves(state):
-            require_finite("A run's frames", leaf)
-        require(np.abs(state.x).max(initial=0) < most, f"Positions must be below {most:.3g} m.")
+    return table["step"], RolloutState(states_in(rows, like.particles), **received), tallies

@@ -63,12 +63,9 @@ def reporting(report: Callable[[], str]) -> Iterator[None]:
 class Stop:
     """A request to stop in good order."""
 
-    what: str
-    """A sentence on what is done about it."""
-    ready: bool = False
-    """Whether there is anything to keep; as long as not, a signal ends the process at once."""
-    signal: int = 0
-    """Number of the signal that came; zero if none did."""
+    what: str  # a sentence on what is done about it
+    ready: bool = False  # whether there is anything to keep; as long as not, a signal ends the process at once
+    signal: int = 0  # number of the signal that came; zero if none did
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from mpmjax.autodiff import guard, rematerialised
 from mpmjax.checks import (
     canonical,
     checked,
+    first_unmet,
     is_traced,
     require,
     require_finite,
@@ -30,13 +31,13 @@ from mpmjax.simulation._diffrax import (
     RolloutState,
     StepSolver,
     checkpointed,
-    examined,
+    faulty_particles,
+    gravest,
     initial_state,
     no_vector_field,
-    step_number,
 )
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
-from mpmjax.simulation._run import Run, RunStatistics
+from mpmjax.simulation._run import Fault, Run, RunStatistics
 from mpmjax.simulation._sorting import memory_order
 from mpmjax.state import Particles, Scene, prepare, state_of, warn_of_rounding, with_state
 from mpmjax.stepping import MOST_STEPS, AbstractIntegrator, Explicit, step_for, step_unchecked
@@ -254,17 +255,14 @@ def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
 class End(NamedTuple):
     """The end of an integration."""
 
-    steps: Float[Array, "f"]
-    """Numbers of the saved frames; none if nothing was saved."""
+    steps: Float[Array, "f"]  # numbers of the saved frames; none if nothing was saved
     saved: Any
     """The frames, along a first axis: of each its state or what was observed, and the impulses on colliders and on
     boundaries."""
     state: RolloutState
-    step: Float[Array, ""]
-    """The number of the last step."""
+    step: Float[Array, ""]  # the number of the last step
     statistics: RunStatistics
-    report: Float[Array, ""]
-    """Relative residual of the first tangent solve that did not converge; zero if all did."""
+    report: Float[Array, ""]  # relative residual of the first tangent solve that did not converge; zero if all did
 
 
 @eqx.filter_jit
@@ -298,8 +296,14 @@ def integrate(
     zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
     until, slot = (jnp.asarray(a, start.dtype) for a in (until, slot))
     problem = Problem(scene, particles, stencil, dt, method, observe, start, until, slot, save_every=save_every)
-    if not watch:
-        problem, state = examined(problem, state)
+    if not watch:  # the fault of the start, from values that were not known when they were given
+        arrays, rest = eqx.partition((problem, state), eqx.is_array)
+        constant, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
+        unmet = first_unmet(requirements((constant.scene, constant.particles, constant.method)))
+        fault = gravest(faulty_particles(constant, begin.particles, constant.start * constant.dt))
+        valid = jnp.where(unmet > 0, jnp.nan, 1)  # with a bad parameter what follows would look like numbers
+        state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
+        problem = replace(problem, fault=jnp.where(unmet > 0, Fault.BAD_PARAMETERS, fault), unmet=unmet)
     state = replace(state, order=memory_order(scene, particles, save_every or max_steps)).to_loop_layout()
 
     def frame(t: Any, y: RolloutState, args: Problem) -> Any:
@@ -329,7 +333,7 @@ def integrate(
     final = jax.tree.map(lambda a: a[-1], values["final"])
     steps, saved = jnp.zeros((0,), start.dtype), (None, None, None)
     if save_every is not None:
-        steps, saved = start + step_number(times["frames"]), values["frames"]
+        steps, saved = start + jnp.round(times["frames"]), values["frames"]
     return End(steps, saved, final, start + statistics.steps.astype(start.dtype), statistics, report)
 
 

@@ -237,26 +237,16 @@ class LoadedPoints(eqx.Module):
     """s points that move with particles: u_s = Σ_i N_is u_i with N_is = w_ip + g_ip·r_s, the particle's own motion at
     the arm r_s. So a force reaches no node that its particle does not reach, its sum is right and so is its moment."""
 
-    x: Float[Array, "d s"]
-    """Where they are [m]."""
-    v: Float[Array, "d s"]
-    """Their velocity, v_p + C_p r_s, without a C v_p [m/s]."""
-    deformation: Matrix | None
-    """F of their particles [-], shape (d, d, s); None where a law does not keep it."""
-    rate: Matrix | None
-    """Rate of F [1/s], shape (d, d, s); None without a velocity gradient."""
-    place: Float[Array, "d s"]
-    """Where they were when they were attached [m]."""
-    weight: Float[Array, "s"]
-    """Their undeformed areas [m^(d−1)], or shares [-]."""
-    area: Float[Array, "d s"] | None
-    """Outward normal times area of the undeformed surface [m^(d−1)]; None of points."""
-    arm: Float[Array, "d s"]
-    """r_s [m]: F_p R_s, in the total description R_s."""
-    stencil: Stencil
-    """Nodes, weights and derivatives of the particle that each point is attached to."""
-    particle: Int[Array, "s"]
-    """The number of that particle, shape (s,)."""
+    x: Float[Array, "d s"]  # where they are [m]
+    v: Float[Array, "d s"]  # their velocity, v_p + C_p r_s, without a C v_p [m/s]
+    deformation: Matrix | None  # F of their particles [-], shape (d, d, s); None where a law does not keep it
+    rate: Matrix | None  # rate of F [1/s], shape (d, d, s); None without a velocity gradient
+    place: Float[Array, "d s"]  # where they were when they were attached [m]
+    weight: Float[Array, "s"]  # their undeformed areas [m^(d−1)], or shares [-]
+    area: Float[Array, "d s"] | None  # outward normal times area of the undeformed surface [m^(d−1)]; None of points
+    arm: Float[Array, "d s"]  # r_s [m]: F_p R_s, in the total description R_s
+    stencil: Stencil  # nodes, weights and derivatives of the particle that each point is attached to
+    particle: Int[Array, "s"]  # the number of that particle, shape (s,)
 
     def after(self, time: Scalar) -> "LoadedPoints":
         """The points moved on by a time [s] with their velocity, and turned with its gradient."""

@@ -169,12 +169,9 @@ class Support(AbstractSpring):
     """Springs ½ k_s (e_s + N_s u)² between points and the ground, and dashpots of resistance Σ_s N_sᵀ c_s N_s v."""
 
     points: LoadedPoints
-    stiffness: Float[Array, "d s"]
-    """k_s in each direction [N/m]."""
-    stretch: Float[Array, "d s"]
-    """e_s [m], at the start of the step."""
-    damping: Float[Array, "d s"] | None
-    """c_s [N s/m]; None without dashpots."""
+    stiffness: Float[Array, "d s"]  # k_s in each direction [N/m]
+    stretch: Float[Array, "d s"]  # e_s [m], at the start of the step
+    damping: Float[Array, "d s"] | None  # c_s [N s/m]; None without dashpots
 
     def elongation(self, moved: Displacement) -> Float[Array, "d s"]:
         return self.points.displacement(moved)
@@ -312,12 +309,7 @@ def points_of(
 
 
 def load_force(
-    loads: tuple[AbstractLoad, ...],
-    points: tuple[LoadedPoints, ...],
-    t: Scalar,
-    dt: Scalar,
-    part: float,
-    size: int,
+    loads: tuple[AbstractLoad, ...], points: tuple[LoadedPoints, ...], t: Scalar, dt: Scalar, part: float, size: int
 ) -> NodeVector | None:
     """The forces of loads at their points at the fraction `part` of the step from t, on n = `size` nodes [N], shape
     (n, d), without those of their terms; None without any."""

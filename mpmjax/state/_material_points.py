@@ -79,18 +79,12 @@ class VolumeAverage(eqx.Module):
     """The average of a field over the particles of one material, J̄ = S V0 J, with the symmetric matrix
     S_pq = Σ_i N_i(x_p) N_i(x_q) / Σ_r N_i(x_r) V0_r [1/m^d]."""
 
-    hats: Stencil
-    """The stencil of linear hat functions."""
-    volume: Float[Array, "q"]
-    """V0 [m^d], shape (q,)."""
-    inverse: Float[Array, "n"]
-    """1/Σ_q N_i V0 [1/m^d] of each node, shape (n,); zero where there is no particle."""
-    mirror: Mirror
-    """The mirror images of the scene's symmetry planes."""
-    shape: tuple[int, ...] = eqx.field(static=True)
-    """Number of nodes along each axis."""
-    periodic: tuple[bool, ...] = eqx.field(static=True)
-    """Whether the last node of an axis neighbours its first."""
+    hats: Stencil  # the stencil of linear hat functions
+    volume: Float[Array, "q"]  # V0 [m^d], shape (q,)
+    inverse: Float[Array, "n"]  # 1/Σ_q N_i V0 [1/m^d] of each node, shape (n,); zero where there is no particle
+    mirror: Mirror  # the mirror images of the scene's symmetry planes
+    shape: tuple[int, ...] = eqx.field(static=True)  # number of nodes along each axis
+    periodic: tuple[bool, ...] = eqx.field(static=True)  # whether the last node of an axis neighbours its first
 
     def __call__(self, field: Array) -> Array:
         """S V0 f, shape (q,)."""
@@ -121,14 +115,10 @@ class AveragedDeformation(eqx.Module):
     """F̄ of the particles of one material, and what follows from it."""
 
     average: VolumeAverage
-    F: Matrix
-    """F [-], shape (d, d, q)."""
-    ratio: Float[Array, "q"]
-    """J = det F [-], shape (q,)."""
-    mean: Float[Array, "q"]
-    """J̄ [-], shape (q,)."""
-    scale: Float[Array, "q"]
-    """s = (J̄/J)^{1/d} [-], shape (q,)."""
+    F: Matrix  # F [-], shape (d, d, q)
+    ratio: Float[Array, "q"]  # J = det F [-], shape (q,)
+    mean: Float[Array, "q"]  # J̄ [-], shape (q,)
+    scale: Float[Array, "q"]  # s = (J̄/J)^{1/d} [-], shape (q,)
 
     @property
     def averaged(self) -> Matrix:
@@ -167,16 +157,11 @@ class AveragedDifferential(eqx.Module):
     symmetric map of (δF_p, δJ̄_p), and the average δJ̄ = S V0 (cof F : δF)."""
 
     at: AveragedDeformation
-    P: Matrix
-    """P̄ [Pa]."""
-    tau: Array
-    """P̄ : F̄ [Pa]."""
-    pull: Array
-    """See `AveragedDeformation.pull`."""
-    cofactor: Matrix
-    """cof F [-]."""
-    tangent: Callable[[Matrix], Matrix]
-    """The law's stress differential at F̄."""
+    P: Matrix  # P̄ [Pa]
+    tau: Array  # P̄ : F̄ [Pa]
+    pull: Array  # see `AveragedDeformation.pull`
+    cofactor: Matrix  # cof F [-]
+    tangent: Callable[[Matrix], Matrix]  # the law's stress differential at F̄
 
     def __call__(self, dF: Matrix) -> Matrix:
         """δP [Pa] of δF [-], both of shape (d, d, q)."""
@@ -221,16 +206,11 @@ class AveragedStiffness(AbstractStiffness):
 
     (see `AveragedDifferential`)."""
 
-    rows: tuple[int, int] = eqx.field(static=True)
-    """First particle and the one after the last."""
-    average: VolumeAverage
-    """S."""
-    volumetric: Matrix
-    """V0 c [m^d], shape (d, d, q), the derivative's direction first."""
-    coupling: Matrix
-    """b [J], likewise."""
-    bulk: Float[Array, "q"]
-    """k [J], shape (q,)."""
+    rows: tuple[int, int] = eqx.field(static=True)  # first particle and the one after the last
+    average: VolumeAverage  # S
+    volumetric: Matrix  # V0 c [m^d], shape (d, d, q), the derivative's direction first
+    coupling: Matrix  # b [J], likewise
+    bulk: Float[Array, "q"]  # k [J], shape (q,)
 
     def __call__(self, moved: Displacement) -> Forces:
         """b δJ̄ + V0 c S (b : g + k δJ̄)."""
@@ -256,18 +236,13 @@ class AveragedStiffness(AbstractStiffness):
 class MaterialPoints(eqx.Module):
     """The particles of one material, which pay for their own law only."""
 
-    law: AbstractMaterial
-    """The elastic law in force, frozen in the step."""
-    volume: Float[Array, "q"]
-    """V0 [m^d], shape (q,)."""
+    law: AbstractMaterial  # the elastic law in force, frozen in the step
+    volume: Float[Array, "q"]  # V0 [m^d], shape (q,)
     deformation: Deformation
     """F or its elastic part [-], shape (d, d, q); for a law that depends on J only, J, shape (q,)."""
-    total: bool = eqx.field(static=True)
-    """Whether gradients are with respect to the reference positions."""
-    rows: tuple[int, int] = eqx.field(static=True)
-    """First particle and the one after the last."""
-    viscosity: Viscosity | None
-    """The viscosity beside the law; None without."""
+    total: bool = eqx.field(static=True)  # whether gradients are with respect to the reference positions
+    rows: tuple[int, int] = eqx.field(static=True)  # first particle and the one after the last
+    viscosity: Viscosity | None  # the viscosity beside the law; None without
     average: VolumeAverage | None = None
     """The average by which the energy knows volumes; None if each particle has its own."""
 

@@ -116,12 +116,9 @@ class Bodies(eqx.Module):
 class RigidMaterial(NamedTuple):
     """A material that is a rigid body."""
 
-    number: int
-    """Index among the scene's materials."""
-    layer: int
-    """The layer of nodes that it moves."""
-    freedom: Freedom
-    """Degrees of freedom."""
+    number: int  # index among the scene's materials
+    layer: int  # the layer of nodes that it moves
+    freedom: Freedom  # degrees of freedom
 
 
 class Scene(eqx.Module):
