@@ -23,13 +23,11 @@ from mpmjax.simulation import SimulationError, initial_state, no_steps, raise_fa
 from mpmjax.state import Particles, Scene, State, prepare, with_state
 from mpmjax.stepping import TRBDF2, AbstractIntegrator, Explicit, stable_dt
 
-FRAMES = 8
-"""Number of times at which motions are compared."""
+FRAMES = 8  # number of times at which motions are compared
 _MOST_STEPS = 2**30
 _PILOT_SECONDS = 0.2  # for which so many steps are run as the time of all is foreseen from: a call alone takes time too
 _BRIEF = 0.3  # seconds of a run below which it is timed again
-HOPELESS = 4
-"""A run that fails at a step this many times below the explicit limit is taken to fail at any step."""
+HOPELESS = 4  # a run that fails at a step this many times below the explicit limit is taken to fail at any step
 _FEW = 1000  # explicit steps that no implicit run which follows the motion is cheaper than
 
 Build = Callable[[int], tuple[Scene, Particles]]

@@ -35,12 +35,7 @@ class Energy(eqx.Module):
 
 @checked
 def energy(scene: Scene, particles: Particles) -> Energy:
-    """The energy of the particles.
-
-    Args:
-        scene: the scene.
-        particles: its particles.
-    """
+    """The energy of a scene's particles."""
     scene = canonical(scene, particles.x.dtype)
     return _energy(scene, prepare(scene, particles))
 
@@ -222,12 +217,9 @@ def budget(
     """Run a scene for some steps, with the budgets of energy and momentum for each.
 
     Args:
-        scene: the scene.
-        particles: the particles at step `start`.
+        scene, particles, method, start: as in `simulate`.
         steps: number of steps f.
         dt: step [s].
-        method: the integrator.
-        start: number of the first step.
 
     Returns:
         the particles after the last step, and the budget, each of its terms with a leading axis f.

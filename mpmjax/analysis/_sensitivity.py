@@ -71,16 +71,12 @@ def sensitivity(
     The cost is two to three runs, for a forward run and its tangent. The memory is that of the saved positions.
 
     Args:
-        scene: the scene.
-        particles: the particles at step `start`.
+        scene, particles, dt, method, start: as in `simulate`.
         t1: end time [s], a multiple of the step.
-        dt: step [s], or "stable", as in `simulate`.
-        method: the integrator.
         direction: the change δv0 of the initial velocities, of any size, shape (p, d). Default: normally distributed,
             of variance 1/m_p.
         seed: of the default change.
         save_every: measure every so many steps, and at the end. Default: about a hundred times.
-        start: number of the first step.
         warn_at: growth [-] from which a Python warning is given (under `jax.jit` and the like none is).
 
     Raises:

@@ -22,8 +22,7 @@ import numpy as np
 
 from mpmjax._jax import Tracer
 
-_UNKNOWN = 2**34
-"""Memory assumed to be available if the system does not say [B]."""
+_UNKNOWN = 2**34  # memory assumed to be available if the system does not say [B]
 
 
 def is_traced(tree: Any) -> bool:

@@ -243,11 +243,8 @@ def record(
 
     Args:
         path: the file to be (see `save`).
-        scene: the scene.
+        scene, t1, dt, method: as in `simulate`.
         particles: the particles at step `start`; when resuming, those the recorded run began with.
-        t1: end time [s], a whole number of steps after time zero.
-        dt: step [s], or "stable", as in `simulate`.
-        method: update of the grid velocity.
         save_every: write a frame at the start, every so many steps, and at the end.
         start: number of the first step. Not used when resuming.
         overwrite: replace a file that is there.

@@ -29,8 +29,7 @@ from mpmjax.checks import alternatives, choices, is_enum, is_module, is_own, may
 from mpmjax.state import Scene
 from mpmjax.stepping import AbstractIntegrator
 
-_registered: dict[str, type] = {}
-"""The registered classes that files can hold, by name."""
+_registered: dict[str, type] = {}  # the registered classes that files can hold, by name
 
 Registered = TypeVar("Registered", bound=type)
 

@@ -23,8 +23,7 @@ from mpmjax.simulation._sorting import MemoryOrder, resorted
 from mpmjax.state import Particles, Scene, State, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator, StepInfo, step_compiled
 
-LEAST_STRETCH = 1e-2
-"""Principal stretch [-] below which a particle has collapsed."""
+LEAST_STRETCH = 1e-2  # principal stretch [-] below which a particle has collapsed
 
 
 class RolloutState(eqx.Module):
@@ -212,14 +211,7 @@ class StepSolver(diffrax.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def no_vector_field(t: Any, y: RolloutState, args: Problem) -> RolloutState:
-    """A stand-in for the equation that diffrax expects; the solver does not evaluate it."""
-    del t, args
-    return jax.tree.map(jnp.zeros_like, y)
-
-
-_MOST_LOOPS = 4
-"""Each further loop takes all steps once more."""
+_MOST_LOOPS = 4  # each further loop takes all steps once more
 
 
 class SegmentAdjoint(diffrax.AbstractAdjoint):

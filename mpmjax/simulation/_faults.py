@@ -130,8 +130,7 @@ _WORDS: dict[Fault, tuple[str, str, str]] = {
 }
 """The parts of a fault's message: subject, where no particle can be named; predicate of a particle, after its number,
 and remedy, both empty where they depend on the law (`disallowed`)."""
-LARGEST_LINEARISATION_ERROR = 0.05
-"""Linearisation error [-] of a run beyond which it is warned of."""
+LARGEST_LINEARISATION_ERROR = 0.05  # linearisation error [-] of a run beyond which it is warned of
 _ADVICE = (
     "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
     "inspect run.statistics."

@@ -34,7 +34,6 @@ from mpmjax.simulation._diffrax import (
     faulty_particles,
     gravest,
     initial_state,
-    no_vector_field,
 )
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
 from mpmjax.simulation._run import Fault, Run, RunStatistics
@@ -192,12 +191,9 @@ def rollout(
     mode stores the state before each step and the solutions of implicit solves, and computes the rest again.
 
     Args:
-        scene: the scene.
-        particles: the particles at step `start`.
+        scene, particles, method, start: as in `simulate`.
         steps: number of steps.
         dt: step [s].
-        method: update of the grid velocity.
-        start: number of the first step.
 
     Raises:
         ValueError: from `prepare`; a step that is not positive, or a number of steps that is negative.
@@ -316,7 +312,7 @@ def integrate(
     if save_every is not None:
         subs["frames"] = diffrax.SubSaveAt(t0=True, t1=True, steps=save_every, fn=frame)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(no_vector_field),
+        diffrax.ODETerm(lambda t, y, args: y),  # the solver does not evaluate it
         StepSolver(watch),
         t0=zero,
         t1=all_steps if count is None else count,

@@ -20,15 +20,11 @@ from mpmjax.discretisation import BSpline, Grid, basis_of, first_nodes
 from mpmjax.native import NativeFunction, is_native
 from mpmjax.state import AttachedPoints, Particles, Scene, State, by_material, is_foreign
 
-Order = Int[Array, "p"]
-"""The number of the particle that comes first, second, ..."""
+Order = Int[Array, "p"]  # the number of the particle that comes first, second, ..
 VARIABLE = "MPMJAX_ORDER"
-LEAST = 16_384
-"""Fewer particles stay as they were given: they fit into the cache in any order."""
-STEPS = 50
-"""Steps between two sorts."""
-FEWEST = 10
-"""In runs of fewer steps, in all or between two frames, particles stay as they were given."""
+LEAST = 16_384  # fewer particles stay as they were given: they fit into the cache in any order
+STEPS = 50  # steps between two sorts
+FEWEST = 10  # in runs of fewer steps, in all or between two frames, particles stay as they were given
 MIXED = 0.25
 """Particles are sorted if more than this share of them are in another cell than the one before and the next one."""
 

@@ -19,12 +19,9 @@ from mpmjax.state._particles import Particles
 Rows = Float[Array, "s d"] | Float[np.ndarray, "s d"] | tuple | list
 Numbers = Float[Array, "s"] | Float[np.ndarray, "s"] | tuple[float | int | Array, ...] | list[float | int]
 
-_NARROW = 1.999
-"""A patch narrower than so many particle spacings is not resolved."""
-_FAR = 2.0
-"""How many particle spacings a point may lie off the nearest particle."""
-_ROUNDED = 1e-4
-"""How far the sum of shares may be from one, for rounding's sake."""
+_NARROW = 1.999  # a patch narrower than so many particle spacings is not resolved
+_FAR = 2.0  # how many particle spacings a point may lie off the nearest particle
+_ROUNDED = 1e-4  # how far the sum of shares may be from one, for rounding's sake
 
 
 class AbstractPlace(eqx.Module):

@@ -17,10 +17,8 @@ from mpmjax.state._particles import Particles
 
 Velocity = Point | AbstractMotion | Callable[[Float[Array, "d"]], Float[Array, "d"]]
 
-_ALIKE = 1e-6
-"""Part of a cell by which a region may reach into the next for rounding's sake."""
-_SMALL = 0.02
-"""The least share of a cell that is a particle of its own."""
+_ALIKE = 1e-6  # part of a cell by which a region may reach into the next for rounding's sake
+_SMALL = 0.02  # the least share of a cell that is a particle of its own
 
 
 @checked

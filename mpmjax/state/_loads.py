@@ -51,11 +51,7 @@ class AbstractLoad(eqx.Module):
         return None
 
     def check(self, dim: int) -> None:
-        """Check that it can stand in a scene of a dimension. Default: the place has that dimension.
-
-        Raises:
-            ValueError: it cannot.
-        """
+        """Raise a `ValueError` if it cannot stand in a scene of a dimension. Default: the place has another one."""
         name = type(self).__name__
         require(
             self.on.dim == dim, f"{name} must be on a place with {dim} coordinates, as the grid, got {self.on.dim}."

@@ -56,11 +56,7 @@ class AveragedVolume(eqx.Module):
         return self.materials is None or number in self.materials
 
     def check(self, laws: tuple[AbstractLaw, ...]) -> None:
-        """Check that it can stand in a scene with these laws.
-
-        Raises:
-            ValueError: it cannot.
-        """
+        """Raise a `ValueError` if it cannot stand in a scene with these laws."""
         require(
             all(number < len(laws) for number in self.materials or ()),
             f"AveragedVolume's materials must be numbers below {len(laws)}, of the scene's laws, got {self.materials}.",

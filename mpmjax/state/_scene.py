@@ -277,10 +277,8 @@ class Scene(eqx.Module):
     def rigid_bodies(self) -> tuple[RigidMaterial, ...]:
         """The materials that are rigid bodies."""
         layers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
-        candidates = (
-            (number, layer, law.freedom) for number, (law, layer) in enumerate(zip(self.laws, layers, strict=True))
-        )
-        return tuple(RigidMaterial(n, layer, freedom) for n, layer, freedom in candidates if freedom is not None)
+        each = enumerate(zip(self.laws, layers, strict=True))
+        return tuple(RigidMaterial(n, layer, f) for n, (law, layer) in each if (f := law.freedom) is not None)
 
     @property
     def guides(self) -> dict[int, int]:

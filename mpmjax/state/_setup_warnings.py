@@ -18,15 +18,12 @@ from mpmjax.discretisation import Grid
 from mpmjax.state._particles import Particles
 from mpmjax.state._scene import Scene
 
-_CROWDED = 1.25
-"""How many times the space that there is particles may take."""
+_CROWDED = 1.25  # how many times the space that there is particles may take
 _MOST_BEYOND = 0.05
 """Part of all volume that may lie beyond that after a run: in a splash of water or a heap of sand it is up to 0.03, in
 a vessel whose lowest layer of cells holds twice what fits 0.05 and more."""
-_MOST_CELLS = 10**7
-"""Cells up to which it is looked for."""
-_THIN = 2.0
-"""A body thinner than so many cells is not resolved."""
+_MOST_CELLS = 10**7  # cells up to which it is looked for
+_THIN = 2.0  # a body thinner than so many cells is not resolved
 _MOST_ROUNDING = 2.0**-12
 """Rounding of positions, in spacings, up to which it is not warned of: some 2 000 cells from zero in float32."""
 

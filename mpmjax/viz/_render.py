@@ -25,10 +25,8 @@ COLOURS: dict[str, tuple[str, Callable[[Run, Particles], Any]]] = {
 """The quantities that can colour particles: a label, and a value for each particle."""
 
 SNOW, OCHRE, STEEL, MOSS = (0.91, 0.93, 0.96), (0.82, 0.55, 0.33), (0.36, 0.5, 0.66), (0.45, 0.62, 0.42)
-STONE = (0.55, 0.54, 0.52)
-"""The colour of walls and colliders."""
-_MOST_CELLS = 90
-"""Cells in a direction of the lattice by which particles are shaded."""
+STONE = (0.55, 0.54, 0.52)  # the colour of walls and colliders
+_MOST_CELLS = 90  # cells in a direction of the lattice by which particles are shaded
 
 Draw = Callable[[Particles, np.ndarray, float], None]
 
