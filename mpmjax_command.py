@@ -11,3 +11,7 @@ def main() -> None:
     from mpmjax.cli import main as command  # which sets its own handlers
 
     command()
+
+
+if __name__ == "__main__":  # `python -m mpmjax_command`, the command without its script
+    main()

@@ -17,8 +17,7 @@ from helpers import DESCRIPTIONS, TRANSFERS, block, cloud, ids, thorough
 
 import mpmjax as mpm
 import mpmjax.io._runs
-from mpmjax.io._record import record
-from mpmjax.io._runs import FrameWriter, load, save
+from mpmjax.io._runs import FrameWriter, load, record, save
 from mpmjax.io._transactional_file import StagedFile, undisturbed
 from mpmjax.simulation._diffrax import RolloutState, initial_state
 from mpmjax.simulation._run import Run, RunStatistics, no_steps
@@ -726,7 +725,7 @@ def test_what_is_no_run_is_neither_saved_nor_loaded(bad, says, tmp_path, monkeyp
         save(tmp_path / "run.h5", bad())
     assert not list(tmp_path.iterdir())
     with monkeypatch.context() as patched:
-        patched.setattr(mpmjax.io._runs, "_check_numbers", lambda *_: None)
+        patched.setattr(mpmjax.io._runs, "check_numbers", lambda *_: None)
         save(tmp_path / "run.h5", bad())
     with pytest.raises(ValueError, match=rf"run\.h5 is damaged \({says}"):
         load(tmp_path / "run.h5")

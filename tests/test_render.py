@@ -18,7 +18,6 @@ from mpmjax.viz._render import (
     _remembered,
     _tinted,
     _upright,
-    _walls,
     skin,
 )
 
@@ -103,8 +102,19 @@ def test_walls_are_where_the_boundary_has_them():
     box = mpm.SlipBox((0.1, -inf), (inf, 1.5))
     planes = (mpm.ContactPlane(1, 0.2), mpm.SymmetryPlane(0, 1.0, "below"))
     scene = mpm.Scene(mpm.Grid((20, 20), 0.1), LAWS["neo_hookean"], boundary=(box, *planes))
-    assert [wall[:3] for wall in _walls(scene)] == [(0, 0.1, 1), (1, 1.5, -1), (1, 0.2, 1), (0, 1.0, -1)]
-    assert [wall.mirrored for wall in _walls(scene)] == [False, False, True, True]
+    walls = [wall for boundary in scene.boundary for wall in boundary.walls()]
+    assert [wall[:3] for wall in walls] == [
+        (0, 0.1, 1),
+        (1, 1.5, -1),
+        (1, 0.2, 1),
+        (0, 1.0, -1),
+    ]
+    assert [wall.mirrored for wall in walls] == [
+        False,
+        False,
+        True,
+        True,
+    ]
 
 
 def test_the_ground_is_the_highest_wall_that_bears():

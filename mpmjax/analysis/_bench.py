@@ -12,27 +12,22 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import fields
-from functools import partial
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
 
 from mpmjax.checks import canonical, require, shape_of
-from mpmjax.simulation import Run, SimulationError, before_fault, initial_state, integrate, no_steps, raise_faults
+from mpmjax.simulation import SimulationError, initial_state, no_steps, raise_faults, run_to, segment
 from mpmjax.state import Particles, Scene, State, prepare, with_state
 from mpmjax.stepping import TRBDF2, AbstractIntegrator, Explicit, stable_dt
 
-FRAMES = 8
-"""Number of times at which motions are compared."""
+FRAMES = 8  # number of times at which motions are compared
 _MOST_STEPS = 2**30
 _PILOT_SECONDS = 0.2  # for which so many steps are run as the time of all is foreseen from: a call alone takes time too
 _BRIEF = 0.3  # seconds of a run below which it is timed again
-HOPELESS = 4
-"""A run that fails at a step this many times below the explicit limit is taken to fail at any step."""
+HOPELESS = 4  # a run that fails at a step this many times below the explicit limit is taken to fail at any step
 _FEW = 1000  # explicit steps that no implicit run which follows the motion is cheaper than
 
 Build = Callable[[int], tuple[Scene, Particles]]
@@ -71,10 +66,8 @@ def name_of(method: AbstractIntegrator) -> str:
 class Displacements(NamedTuple):
     """Initial positions of particles, and their displacements at the times of comparison."""
 
-    X: np.ndarray
-    """Initial positions [m], shape (p, d)."""
-    u: np.ndarray
-    """Displacements [m], shape (frames, p, d)."""
+    X: np.ndarray  # initial positions [m], shape (p, d)
+    u: np.ndarray  # displacements [m], shape (frames, p, d)
 
     @property
     def size(self) -> float:
@@ -91,10 +84,8 @@ class Displacements(NamedTuple):
 class Timed(NamedTuple):
     """The outcome of a run."""
 
-    states: list[State] | None
-    """The states at the times of comparison, None of a run that failed."""
-    linearisation_error: float
-    """Linearisation error of the steps [-]."""
+    states: list[State] | None  # the states at the times of comparison, None of a run that failed
+    linearisation_error: float  # linearisation error of the steps [-]
     seconds: float
 
 
@@ -113,16 +104,6 @@ class Clock:
         """Whether a run of compiled code that takes these seconds is allowed: it fits into the seconds left, or into a
         twentieth of all."""
         return seconds <= max(self.left, self.seconds / 20)
-
-
-_PLAIN_LOOP: dict[str, Any] = {
-    "max_steps": _MOST_STEPS,
-    "save_every": None,
-    "observe": None,
-    "adjoint": diffrax.ForwardMode(),
-    "progress": False,
-    "watch": True,
-}
 
 
 class Bench(NamedTuple):
@@ -156,7 +137,7 @@ class Bench(NamedTuple):
 
     def run(self, method: AbstractIntegrator, steps: int) -> Timed:
         """The run, compiled before; of two brief ones the faster."""
-        self._go(method, steps, 1, 1)
+        self.timed(method, steps, 1, 1)
         first = self.timed(method, steps, FRAMES, steps // FRAMES)
         if first.states is None or first.seconds >= _BRIEF:
             return first
@@ -164,51 +145,31 @@ class Bench(NamedTuple):
 
     def foresee(self, method: AbstractIntegrator, steps: int) -> float:
         """The seconds of a number of steps, estimated from fewer of them."""
-        self._go(method, steps, 1, 1)
+        self.timed(method, steps, 1, 1)  # which compiles
         some, seconds = 1, self.timed(method, steps, 1, 1).seconds
         while seconds < _PILOT_SECONDS and some < steps:
             some = min(4 * some, steps)
             seconds = self.timed(method, steps, 1, some).seconds
         return seconds / some * steps
 
-    def timed(self, method: AbstractIntegrator, steps: int, frames: int, each: int) -> Timed:
-        """As `_go`, with the seconds that it took."""
-        begun = time.perf_counter()
-        states, linearisation_error = self._go(method, steps, frames, each)
-        return Timed(states, linearisation_error, time.perf_counter() - begun)
-
-    def why(self, method: AbstractIntegrator, steps: int) -> str:
-        """The error message of a run that fails."""
-        try:
-            self._go(method, steps, FRAMES, steps // FRAMES, throw=True)
-        except SimulationError as error:
-            return str(error)
-        return "It ended well."
-
-    def _go(
-        self, method: AbstractIntegrator, steps: int, frames: int, each: int, *, throw: bool = False
-    ) -> tuple[list[State] | None, float]:
-        """The states after each of `frames` times `each` steps of t1 / `steps`, and their linearisation
-        error. A faulty run has no states, or raises with `throw`."""
-        dtype = self.particles.x.dtype
+    def timed(self, method: AbstractIntegrator, steps: int, frames: int, each: int, *, throw: bool = False) -> Timed:
+        """The states after each of `frames` times `each` steps of t1 / `steps`, and the seconds that they took. A
+        faulty run has no states, or raises with `throw`."""
+        begun, dtype = time.perf_counter(), self.particles.x.dtype
         scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)
         state, states, statistics = initial_state(scene, self.particles), [], no_steps(dtype)
         for k in range(frames):
-            begin, first, count = state, jnp.asarray(k * each, dtype), jnp.asarray(each, dtype)
-            go = partial(integrate, scene, self.particles, begin, first, count, dt, method, **_PLAIN_LOOP)
-            go = partial(go, until=np.asarray(np.inf, dtype))
-            reached = go()
-            state, new = reached.state, reached.statistics
+            state, new, before = segment(
+                scene, self.particles, state, k * each, each, dt, method, max_steps=_MOST_STEPS
+            )
             statistics = statistics.merged(new)
             if not bool(jax.block_until_ready(statistics.healthy)):
                 if throw:
-                    final = with_state(self.particles, state.particles)
-                    number = statistics.steps.astype(dtype)
-                    run = Run(scene, method, dt, jnp.zeros((0,), dtype), None, None, final, number, statistics)
-                    raise_faults(run, self.particles, partial(before_fault, go, begin, new), 0)
-                return None, 0.0
+                    run = run_to(state, statistics.steps, statistics, scene, self.particles, dt, method)
+                    raise_faults(run, self.particles, before, 0)
+                return Timed(None, 0.0, time.perf_counter() - begun)
             states.append(state.particles)
-        return states, float(statistics.linearisation_error)
+        return Timed(states, float(statistics.linearisation_error), time.perf_counter() - begun)
 
 
 def _rms(distance: np.ndarray) -> Any:
@@ -223,32 +184,17 @@ class _RefinedRun(NamedTuple):
     steps: int
     seconds: float
     states: list[State] | None
-    motion: Displacements | None
-    """None if the run failed."""
+    motion: Displacements | None  # None if the run failed
     change: float
-
-    @property
-    def dt(self) -> float:
-        """Δt [s]."""
-        return self.bench.t1 / self.steps
 
 
 def settle(
     build: Build, bench: Bench, error: float, seconds: float, say: Say = lambda line: None
 ) -> tuple[float, Trial, Displacements]:
-    """The best reference run within an allowance of time: the longest explicit step on the scene's own grid that trials
-    may take, `stable_dt` of the whole motion [s]; the run, whose error is an estimate; and its motion.
-
-    Args:
-        build: makes the scene at a refinement.
-        bench: the bench of the scene's own grid.
-        error: the target error of the trials.
-        seconds: the allowance, compilation included [s].
-        say: called with a line on each run.
-
-    Raises:
-        ValueError: nothing moves, or no run ended well in that time; the message says what went wrong.
-    """
+    """The best reference run within `seconds`, compilation included: the longest explicit step on the grid of the
+    scene's own bench that trials may take, `stable_dt` of the whole motion [s]; the run, whose error is an estimate,
+    for trials of this target error; and its motion. `say` is called with a line on each run. A ValueError says that
+    nothing moves, or why no run ended well in that time."""
     clock, growth = Clock(seconds), 2 ** (bench.particles.dim + 1)
     limit = bench.limit([])
     steps, method = bench.whole(limit), Explicit()
@@ -258,7 +204,26 @@ def settle(
         steps, method = 2 * FRAMES, TRBDF2()
     elif not clock.allows(2 * foreseen):
         raise ValueError(f"{steps} explicit steps take {foreseen:.2g} s and two runs are needed: {_more(seconds)}")
-    limit, good = _resolved_in_time(bench, method, steps, limit, error, clock, say)
+    good = None
+    while True:  # until the step resolves the motion, or the time is up
+        new, dt = _refined_run(bench, method, steps, good, say), bench.t1 / steps
+        if new.states is not None and new.motion is not None:
+            require(new.motion.size > 0, "Nothing moves in this scene, so there is no motion to be right or wrong.")
+            limit, good = min(limit, bench.limit(new.states)), new
+        allowed = clock.allows(2 * new.seconds)
+        if good is not None and (new.change <= error / 3 or dt <= limit * (1 + 1e-9) or not allowed):
+            break
+        if not allowed or (good is None and dt < limit / HOPELESS):
+            why = "It ended well."
+            try:
+                bench.timed(method, steps, FRAMES, steps // FRAMES, throw=True)
+            except SimulationError as fault:
+                why = str(fault)
+            raise ValueError(
+                f"The reference run, {name_of(method)} in {steps} steps ({new.seconds:.2g} s), fails, and half "
+                f"the step will not do or takes too long. {why}"
+            )
+        steps = max(2 * steps, bench.whole(limit) if method.is_explicit else 0)
     while growth * good.seconds < clock.left and (good.bench is bench or good.change > error / 3):
         finer = _refined_run(Bench.of(build, 2 * good.bench.refinement, bench.t1), method, 2 * good.steps, good, say)
         if finer.motion is None:
@@ -272,31 +237,9 @@ def settle(
         good = again
     assert good.motion is not None
     require(math.isfinite(good.change), f"The motion of one run only is known: {_more(seconds)}")
-    trial = Trial(method, good.bench.refinement, good.dt, good.steps, good.seconds, good.change)
+    refinement, dt = good.bench.refinement, bench.t1 / good.steps
+    trial = Trial(method, refinement, dt, good.steps, good.seconds, good.change)
     return limit, trial, good.motion
-
-
-def _resolved_in_time(
-    bench: Bench, method: AbstractIntegrator, steps: int, limit: float, error: float, clock: Clock, say: Say
-) -> tuple[float, _RefinedRun]:
-    """The explicit limit over the motion on the scene's own grid [s], and the run whose step resolves the motion, or
-    the last one within the time."""
-    good = None
-    while True:
-        new = _refined_run(bench, method, steps, good, say)
-        if new.states is not None and new.motion is not None:
-            require(new.motion.size > 0, "Nothing moves in this scene, so there is no motion to be right or wrong.")
-            limit, good = min(limit, bench.limit(new.states)), new
-        hopeless = good is None and new.dt < limit / HOPELESS
-        enough = good is not None and (new.change <= error / 3 or new.dt <= limit * (1 + 1e-9))
-        if good is not None and (enough or not clock.allows(2 * new.seconds)):
-            return limit, good
-        if hopeless or not clock.allows(2 * new.seconds):
-            raise ValueError(
-                f"The reference run, {name_of(method)} in {steps} steps ({new.seconds:.2g} s), fails, and half "
-                f"the step will not do or takes too long. {bench.why(method, steps)}"
-            )
-        steps = max(2 * steps, bench.whole(limit) if method.is_explicit else 0)
 
 
 def _refined_run(

@@ -11,19 +11,10 @@ from mpmjax._types import Array, Float, Matrix, NodeVector, ParticleScalar, Scal
 from mpmjax.checks import canonical, checked, require, require_positive, require_whole
 from mpmjax.discretisation import Gathered, Stencil, gather, scatter
 from mpmjax.geometry import rigid_body
-from mpmjax.implicit import ElasticPotential, Projection
+from mpmjax.implicit import Projection
 from mpmjax.potential import Forces
 from mpmjax.state import Particles, Scene, prepare
-from mpmjax.stepping import (
-    AbstractIntegrator,
-    Explicit,
-    GridUpdate,
-    Nodes,
-    grid_to_particles,
-    reaction,
-    start_nodes,
-    update,
-)
+from mpmjax.stepping import AbstractIntegrator, Explicit, grid_to_particles, reaction, start_nodes, update
 
 
 class Energy(eqx.Module):
@@ -44,12 +35,7 @@ class Energy(eqx.Module):
 
 @checked
 def energy(scene: Scene, particles: Particles) -> Energy:
-    """The energy of the particles.
-
-    Args:
-        scene: the scene.
-        particles: its particles.
-    """
+    """The energy of a scene's particles."""
     scene = canonical(scene, particles.x.dtype)
     return _energy(scene, prepare(scene, particles))
 
@@ -231,12 +217,9 @@ def budget(
     """Run a scene for some steps, with the budgets of energy and momentum for each.
 
     Args:
-        scene: the scene.
-        particles: the particles at step `start`.
+        scene, particles, method, start: as in `simulate`.
         steps: number of steps f.
         dt: step [s].
-        method: the integrator.
-        start: number of the first step.
 
     Returns:
         the particles after the last step, and the budget, each of its terms with a leading axis f.
@@ -263,7 +246,7 @@ def budget(
 def _budget(
     scene: Scene, particles: Particles, start: Array, dt: Scalar, method: AbstractIntegrator, steps: int
 ) -> tuple[Particles, Budget]:
-    def body(before: Particles, n: Array) -> tuple[Particles, Budget]:
+    def stepped(before: Particles, n: Array) -> tuple[Particles, Budget]:
         t = (start + n) * dt
         stencil = scene.stencil(before, t)
         nodes = start_nodes(
@@ -279,120 +262,106 @@ def _budget(
         new = update(nodes, method)
         trial = grid_to_particles(scene, before, nodes, new)
         after = scene.return_map(trial, dt)
-        return after, _step_budget(scene, before, trial, after, nodes, new, method)
+        potential = nodes.potential
+        stencil, images = potential.stencil, potential.mirror
+        v0, v1 = nodes.velocity, new.motion.velocity
+        all0, all1 = images.unfold(v0), images.unfold(v1)
+        mean = (v0 + v1) / 2
+
+        # impulses at the nodes
+        friction = nodes.mass[:, None] * (v1 - new.solved.velocity)
+        raw = scatter(stencil, before.mass[None], None, scene.grid.size)
+        weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
+        body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
+        held, free = reaction(nodes, new.solved, new.elastic), nodes.projection
+        if new.constrained is not None:
+            free = Projection(*new.constrained.beyond_boundaries())
+        boundary, missed = free.combine(0, held), free.combine(held, 0)
+
+        # viscosity: its impulse, and what it dissipates of the velocity that it resists
+        assert new.elastic is not None  # P2G was asked for momentum and force apart
+        resisted, elastic, elastic_at_start = new.motion.resisted, new.elastic, dt * nodes.force
+        viscous, dissipated = jnp.zeros_like(v0), jnp.zeros((), v0.dtype)
+        if resisted is not None:
+            viscous, dissipated = -dt * potential.viscous_resistance(resisted), dt * potential.power(resisted)
+        elif method.explicit_viscosity and potential.viscous:  # part of the force
+            drags = potential.drags()
+            forces, dissipated = [force for force, _ in drags], sum((power for _, power in drags), dissipated)
+            if potential.material_viscous and before.C is not None:
+                C = components(before.C)
+                stress = potential.weighted_viscous_stress(C)
+                forces.append(Forces(slopes=-jnp.swapaxes(stress, 0, 1)))
+                dissipated = dissipated + (stress * C).sum()
+            if forces:
+                force = potential.on_nodes(forces)
+                viscous, dissipated = jnp.where(nodes.occupied, dt * force, 0), dt * dissipated
+                elastic, elastic_at_start = elastic - viscous, elastic_at_start - dt * force
+
+        # particle and nodes beside each other
+        v_old = components(before.v)
+        arrived = _gathered(scene, stencil, all1)
+        change = (
+            _gathered(scene, stencil, all1 - images.unfold(new.before(nodes))) if scene.transfer.needs_change else None
+        )
+        moved = arrived.value
+        C_old, C_new = (components(q.C) if scene.transfer.affine and q.C is not None else None for q in (before, after))
+        beside = scene.transfer.velocity(v_old, arrived, change) - moved
+        lost_p2g, gained_p2g = _mismatch(stencil, before.mass, v_old, C_old, all0)
+        lost_g2p, _ = _mismatch(stencil, before.mass, moved, arrived.affine, all1)
+        kept = (before.mass * beside * (moved + beside / 2)).sum()
+        if C_new is not None and arrived.affine is not None:
+            kept = kept + (before.mass * ((C_new**2 - arrived.affine**2) * stencil.moment).sum(axis=(0, 1))).sum() / 2
+            if scene.kernel.order == 1:  # its moment D changes with the particle's place
+                turn = scene.stencil(after).moment - stencil.moment
+                kept = kept + (before.mass * (C_new**2 * turn).sum(axis=(0, 1))).sum() / 2
+
+        averaging = jnp.zeros((), v0.dtype)  # by the averages of the particles' new places
+        if scene.volume is not None:
+            pairs = zip(potential.material_points, scene.material_points(after), strict=True)
+            changes = (n.volume * (n.energy_density(n.deformation) - o.energy_density(n.deformation)) for o, n in pairs)
+            averaging = sum((change.sum() for change in changes), averaging)
+        old, new_energy = energy_of(scene, before), energy_of(scene, after)
+        moved_by = dt * new.motion.carrier
+        stored = potential.energy(moved_by)
+        in_terms = potential.term_energy(moved_by) - potential.term_energy(None)
+        share = jnp.where(nodes.occupied, images.fold(jnp.broadcast_to(raw, v0.shape)), 0)
+        share = nodes.per_mass(share)  # of an impulse at a node in the particles' momentum: 1 but at symmetry planes
+        return after, Budget(
+            EnergyBudget(
+                kinetic=new_energy.kinetic - old.kinetic,
+                elastic=new_energy.elastic - old.elastic + in_terms,
+                potential=new_energy.potential - old.potential,
+                p2g=lost_p2g,
+                g2p=lost_g2p - kept,
+                implicit=((elastic_at_start - elastic) * mean).sum(),
+                boundary=(boundary * mean).sum(),
+                friction=(friction * mean).sum(),
+                body_force=(body * mean).sum(),
+                viscous=dissipated,
+                plastic=(before.volume * (energy_density(scene, trial) - energy_density(scene, after))).sum(),
+                averaging=averaging,
+                solver=(missed * mean).sum(),
+                time_integration=stored
+                - potential.energy(jnp.zeros_like(v0))
+                + (elastic_at_start * mean).sum()
+                + (weight * (mean - new.motion.carrier)).sum()
+                + (viscous * mean).sum()
+                + dissipated,
+            ),
+            MomentumBudget(
+                change=(before.mass * components(after.v - before.v)).sum(axis=1),
+                gravity=(share * weight).sum(axis=0),
+                body_force=(share * body).sum(axis=0),
+                boundary=(share * (boundary + missed)).sum(axis=0),
+                friction=(share * friction).sum(axis=0),
+                elastic=(share * elastic).sum(axis=0),
+                viscous=(share * viscous).sum(axis=0),
+                transfer=gained_p2g + (before.mass * beside).sum(axis=1),
+            ),
+        )
 
     numbers = jnp.arange(steps, dtype=particles.x.dtype)
-    return jax.lax.scan(body, particles, numbers)
-
-
-def _step_budget(
-    scene: Scene,
-    before: Particles,
-    trial: Particles,
-    after: Particles,
-    nodes: Nodes,
-    new: GridUpdate,
-    method: AbstractIntegrator,
-) -> Budget:
-    potential, dt = nodes.potential, nodes.dt
-    stencil, images = potential.stencil, potential.mirror
-    v0, v1 = nodes.velocity, new.motion.velocity
-    all0, all1 = images.unfold(v0), images.unfold(v1)
-    mean = (v0 + v1) / 2
-
-    # impulses at the nodes
-    friction = nodes.mass[:, None] * (v1 - new.solved.velocity)
-    raw = scatter(stencil, before.mass[None], None, scene.grid.size)
-    weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
-    body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
-    held, free = reaction(nodes, new.solved, new.elastic), nodes.projection
-    if new.constrained is not None:
-        free = Projection(*new.constrained.beyond_boundaries())
-    boundary, missed = free.combine(0, held), free.combine(held, 0)
-
-    # viscosity: its impulse, and what it dissipates of the velocity that it resists
-    assert new.elastic is not None  # P2G was asked for momentum and force apart
-    resisted, elastic, elastic_at_start = new.motion.resisted, new.elastic, dt * nodes.force
-    viscous, dissipated = jnp.zeros_like(v0), jnp.zeros((), v0.dtype)
-    if resisted is not None:
-        viscous, dissipated = -dt * potential.viscous_resistance(resisted), dt * potential.power(resisted)
-    elif method.explicit_viscosity and potential.viscous:  # part of the force
-        drags = potential.drags()
-        forces, dissipated = [force for force, _ in drags], sum((power for _, power in drags), dissipated)
-        if potential.material_viscous and before.C is not None:
-            C = components(before.C)
-            stress = potential.weighted_viscous_stress(C)
-            forces.append(Forces(slopes=-jnp.swapaxes(stress, 0, 1)))
-            dissipated = dissipated + (stress * C).sum()
-        if forces:
-            force = potential.on_nodes(forces)
-            viscous, dissipated = jnp.where(nodes.occupied, dt * force, 0), dt * dissipated
-            elastic, elastic_at_start = elastic - viscous, elastic_at_start - dt * force
-
-    # particle and nodes beside each other
-    v_old = components(before.v)
-    arrived = _gathered(scene, stencil, all1)
-    change = _gathered(scene, stencil, all1 - images.unfold(new.before(nodes))) if scene.transfer.needs_change else None
-    moved = arrived.value
-    C_old, C_new = (components(q.C) if scene.transfer.affine and q.C is not None else None for q in (before, after))
-    beside = scene.transfer.velocity(v_old, arrived, change) - moved
-    lost_p2g, gained_p2g = _mismatch(stencil, before.mass, v_old, C_old, all0)
-    lost_g2p, _ = _mismatch(stencil, before.mass, moved, arrived.affine, all1)
-    kept = (before.mass * beside * (moved + beside / 2)).sum()
-    if C_new is not None and arrived.affine is not None:
-        kept = kept + (before.mass * ((C_new**2 - arrived.affine**2) * stencil.moment).sum(axis=(0, 1))).sum() / 2
-        if scene.kernel.order == 1:  # its moment D changes with the particle's place
-            turn = scene.stencil(after).moment - stencil.moment
-            kept = kept + (before.mass * (C_new**2 * turn).sum(axis=(0, 1))).sum() / 2
-
-    old, new_energy = energy_of(scene, before), energy_of(scene, after)
-    moved_by = dt * new.motion.carrier
-    stored = potential.energy(moved_by)
-    share = jnp.where(nodes.occupied, images.fold(jnp.broadcast_to(raw, v0.shape)), 0)
-    share = nodes.per_mass(share)  # of an impulse at a node in the particles' momentum: 1 but at symmetry planes
-    return Budget(
-        EnergyBudget(
-            kinetic=new_energy.kinetic - old.kinetic,
-            elastic=new_energy.elastic - old.elastic + potential.term_energy(moved_by) - potential.term_energy(None),
-            potential=new_energy.potential - old.potential,
-            p2g=lost_p2g,
-            g2p=lost_g2p - kept,
-            implicit=((elastic_at_start - elastic) * mean).sum(),
-            boundary=(boundary * mean).sum(),
-            friction=(friction * mean).sum(),
-            body_force=(body * mean).sum(),
-            viscous=dissipated,
-            plastic=(before.volume * (energy_density(scene, trial) - energy_density(scene, after))).sum(),
-            averaging=_averaged_anew(scene, potential, after),
-            solver=(missed * mean).sum(),
-            time_integration=stored
-            - potential.energy(jnp.zeros_like(v0))
-            + (elastic_at_start * mean).sum()
-            + (weight * (mean - new.motion.carrier)).sum()
-            + (viscous * mean).sum()
-            + dissipated,
-        ),
-        MomentumBudget(
-            change=(before.mass * components(after.v - before.v)).sum(axis=1),
-            gravity=(share * weight).sum(axis=0),
-            body_force=(share * body).sum(axis=0),
-            boundary=(share * (boundary + missed)).sum(axis=0),
-            friction=(share * friction).sum(axis=0),
-            elastic=(share * elastic).sum(axis=0),
-            viscous=(share * viscous).sum(axis=0),
-            transfer=gained_p2g + (before.mass * beside).sum(axis=1),
-        ),
-    )
-
-
-def _averaged_anew(scene: Scene, potential: ElasticPotential, after: Particles) -> Float[Array, ""]:
-    """The change of the elastic energy [J] by the averages of the particles' new places."""
-    none = jnp.zeros((), after.x.dtype)
-    if scene.volume is None:
-        return none
-    pairs = zip(potential.material_points, scene.material_points(after), strict=True)
-    changes = (n.volume * (n.energy_density(n.deformation) - o.energy_density(n.deformation)) for o, n in pairs)
-    return sum((change.sum() for change in changes), none)
+    return jax.lax.scan(stepped, particles, numbers)
 
 
 def _gathered(scene: Scene, stencil: Stencil, nodes: NodeVector) -> Gathered:

@@ -71,16 +71,12 @@ def sensitivity(
     The cost is two to three runs, for a forward run and its tangent. The memory is that of the saved positions.
 
     Args:
-        scene: the scene.
-        particles: the particles at step `start`.
+        scene, particles, dt, method, start: as in `simulate`.
         t1: end time [s], a multiple of the step.
-        dt: step [s], or "stable", as in `simulate`.
-        method: the integrator.
         direction: the change δv0 of the initial velocities, of any size, shape (p, d). Default: normally distributed,
             of variance 1/m_p.
         seed: of the default change.
         save_every: measure every so many steps, and at the end. Default: about a hundred times.
-        start: number of the first step.
         warn_at: growth [-] from which a Python warning is given (under `jax.jit` and the like none is).
 
     Raises:
@@ -120,8 +116,31 @@ def sensitivity(
     report = _measure(
         moved[1:], steps[1:] - steps[0], statistics, unsolved, particles.mass, change, jnp.asarray(dt, dtype)
     )
-    if not is_traced(report) and not report.worst <= warn_at:
-        warnings.warn(_complaint(report, statistics, float(unsolved), warn_at), stacklevel=2)
+    if is_traced(report) or report.worst <= warn_at:
+        return report
+    if not statistics.healthy:
+        what = (
+            f"meets a fault at step {int(statistics.fault_step)}"
+            if int(statistics.fault) != Fault.NONE
+            else "does not solve its equations"
+        )
+        why = f"the run {what} and has no derivative from there on: see what simulate says of it."
+    elif float(unsolved) > 0:
+        why = (
+            "the run has a derivative that is not known: the tangent solve of a step did not converge (relative "
+            f"residual {float(unsolved):.2g}). Raise the max_steps of the method's adjoint_solver, or leave "
+            "its preconditioner at DiagonalPreconditioner()."
+        )
+    else:
+        first = int(jnp.argmax(~(report.growth <= warn_at)))
+        why = (
+            f"the derivative of the positions by the initial velocities grows to {float(report.worst):.2g} times that "
+            f"of free flight, at a rate of {float(report.rate):.3g} /s; it passes {warn_at:.4g} by step "
+            f"{int(report.steps[first])} (t = {float(report.times[first]):.4g} s). Gradients over this horizon say "
+            "little: shorten it, or reduce dt if the step is unstable."
+        )
+    horizon = f"Over {int(report.steps[-1])} steps (t = {float(report.times[-1]):.4g} s) "
+    warnings.warn(horizon + why, stacklevel=2)
     return report
 
 
@@ -149,28 +168,3 @@ def _measure(
     scatter = (weight * centred**2).sum()
     rate = (weight * centred * logarithm).sum() / jnp.where(scatter == 0, 1, scatter)
     return Sensitivity(times=times, steps=steps, growth=growth, rate=rate)
-
-
-def _complaint(report: Sensitivity, statistics: RunStatistics, unsolved: float, warn_at: float | int) -> str:
-    steps, times, over = report.steps, report.times, ~(report.growth <= warn_at)
-    told = f"Over {int(steps[-1])} steps (t = {float(times[-1]):.4g} s) "
-    if not statistics.healthy:
-        what = (
-            f"meets a fault at step {int(statistics.fault_step)}"
-            if int(statistics.fault) != Fault.NONE
-            else "does not solve its equations"
-        )
-        return told + f"the run {what} and has no derivative from there on: see what simulate says of it."
-    if unsolved > 0:
-        return told + (
-            f"the run has a derivative that is not known: the tangent solve of a step did not converge (relative "
-            f"residual {unsolved:.2g}). Raise the max_steps of the method's adjoint_solver, or leave "
-            "its preconditioner at DiagonalPreconditioner()."
-        )
-    first = int(jnp.argmax(over))
-    return told + (
-        f"the derivative of the positions by the initial velocities grows to {float(report.worst):.2g} times that of "
-        f"free flight, at a rate of {float(report.rate):.3g} /s; it passes {warn_at:.4g} by step {int(steps[first])} "
-        f"(t = {float(times[first]):.4g} s). Gradients over this horizon say little: shorten it, or reduce dt if the "
-        "step is unstable."
-    )

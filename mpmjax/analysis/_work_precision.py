@@ -45,18 +45,18 @@ class WorkPrecision(NamedTuple):
         reference. An explicit step beyond the limit is never good enough.
         """
         trials = [t for t in self.trials if not (t.method.is_explicit and t.dt * t.refinement > self.limit)]
-        errors = [max(t.error, self._next(t).error, self.reference.error) for t in trials]
+
+        def at_next(trial: Trial) -> float:  # the error at the next smaller step that was tried
+            same = trial.refinement, name_of(trial.method)
+            tried = [t for t in self.trials if (t.refinement, name_of(t.method)) == same]
+            finer = [t for t in tried if t.dt < trial.dt and not math.isnan(t.error)]
+            return max(finer, key=lambda t: t.dt, default=trial).error
+
+        errors = [max(t.error, at_next(t), self.reference.error) for t in trials]
         enough = max(self.target, 1.25 * min((e for e in errors if e >= 0), default=math.inf))
         good = [t for t, e in zip(trials, errors, strict=True) if e <= enough < math.inf]
         good = [t for t in good if explicit in (None, t.method.is_explicit)]
         return min(good, key=lambda trial: trial.seconds, default=None)
-
-    def _next(self, trial: Trial) -> Trial:
-        """The trial with the next smaller step, or the trial itself."""
-        same = (trial.refinement, name_of(trial.method))
-        tried = [t for t in self.trials if (t.refinement, name_of(t.method)) == same]
-        finer = [t for t in tried if t.dt < trial.dt and not math.isnan(t.error)]
-        return max(finer, key=lambda t: t.dt, default=trial)
 
     def verdict(self) -> str:
         """The cheapest setting in words, with the cost of the other kind of method, explicit or implicit."""
@@ -180,18 +180,16 @@ def work_precision(
                 note(bench, method, steps, 2 * trial.seconds, math.nan)
                 return
 
-    def bettered(method: AbstractIntegrator) -> bool:
-        """Whether others reach the errors of this implicit method on the scene's own grid in no more seconds."""
-        first = [t for t in trials if t.refinement == 1 and t.method.is_explicit == method.is_explicit]
-        finished = [t for t in first if t.method is method and math.isfinite(t.error)]
-        others = [t for t in first if t.method is not method]
-        return all(any(o.error <= _AS_GOOD * t.error and o.seconds <= t.seconds for o in others) for t in finished)
-
     benches = {1: bench}
     plan = [(n, method) for n, method in itertools.product(refinements, methods) if n <= reference.refinement or n == 1]
     for k, (n, method) in enumerate(plan):
-        if n > 1 and 1 in refinements and not method.is_explicit and bettered(method):
-            continue
+        if n > 1 and 1 in refinements and not method.is_explicit:
+            # whether others reach the errors of this method on the scene's own grid in no more seconds
+            first = [t for t in trials if t.refinement == 1 and not t.method.is_explicit]
+            finished = [t for t in first if t.method is method and math.isfinite(t.error)]
+            others = [t for t in first if t.method is not method]
+            if all(any(o.error <= _AS_GOOD * t.error and o.seconds <= t.seconds for o in others) for t in finished):
+                continue
         if clock.left <= 0:
             skipped.append(name_of(method) + (f" at spacing / {n}" if n > 1 else ""))
             continue

@@ -45,12 +45,9 @@ _WORDS: dict[Any, str] = {
 
 
 def checked(function: Function) -> Function:
-    """Decorate a public function to check that its arguments are of the kinds that their annotations name, and to allow
-    broadcasting of different ranks within it, whatever `jax_numpy_rank_promotion` says outside.
-
-    Raises:
-        ValueError: one is not.
-    """
+    """Decorate a public function to check that its arguments are of the kinds that their annotations name (else a
+    ValueError), and to allow broadcasting of different ranks within it, whatever `jax_numpy_rank_promotion` says
+    outside."""
     signature = inspect.signature(function)
     hints = {p.name: p.annotation for p in signature.parameters.values() if p.annotation is not p.empty}
     owner = function.__qualname__.removesuffix(".__init__")
@@ -69,11 +66,7 @@ def checked(function: Function) -> Function:
 
 def require_fields(module: eqx.Module) -> None:
     """Check that every field of a module is of the kind that its annotation names, and can fix a program if it is
-    static.
-
-    Raises:
-        ValueError: one is not.
-    """
+    static."""
     for name, hint, static in _hints(type(module)):
         value, what = getattr(module, name), f"{type(module).__name__}'s {name}"
         require_kind(what, value, hint)
@@ -90,11 +83,8 @@ def _hints(module: type) -> tuple[tuple[str, Any, bool], ...]:
 
 
 def require_kind(name: str, value: Any, hint: Any) -> None:
-    """Check that a value is of a kind that an annotation names.
-
-    Raises:
-        ValueError: it is not; with the kinds that are known, and which of them may have been meant.
-    """
+    """Raise a `ValueError` if a value is of no kind that an annotation names, with these kinds, and which of them
+    may have been meant."""
     if not _takes(hint, value):
         shown = f"the class {value.__name__}" if isinstance(value, type) else shortened(repr(value))
         raise ValueError(f"{name} must be {_in_words(hint)}, got {shown}{_meant(hint, value)}")

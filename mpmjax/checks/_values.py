@@ -22,8 +22,7 @@ import numpy as np
 
 from mpmjax._jax import Tracer
 
-_UNKNOWN = 2**34
-"""Memory assumed to be available if the system does not say [B]."""
+_UNKNOWN = 2**34  # memory assumed to be available if the system does not say [B]
 
 
 def is_traced(tree: Any) -> bool:
@@ -35,8 +34,7 @@ class Requirement(NamedTuple):
     """A requirement on values that are being traced."""
 
     message: str
-    met: Callable[[], Any]
-    """Computes bools that are all true if it is met."""
+    met: Callable[[], Any]  # computes bools that are all true if it is met
 
 
 _put_off: ContextVar[list[Requirement] | None] = ContextVar("_put_off", default=None)
@@ -44,11 +42,8 @@ _put_off: ContextVar[list[Requirement] | None] = ContextVar("_put_off", default=
 
 
 def requirements(tree: Any) -> list[Requirement]:
-    """The requirements of the modules in a tree on their traced values, in a fixed order.
-
-    Raises:
-        ValueError: a value that is known is not as its module requires, as `equinox.tree_at` can make it.
-    """
+    """The requirements of the modules in a tree on their traced values, in a fixed order; a ValueError if one on
+    values that are known is not met, as `equinox.tree_at` can make it."""
     gathered: list[Requirement] = []
     token = _put_off.set(gathered)
     try:
@@ -95,13 +90,8 @@ def shortened(text: str, most: int = 80) -> str:
 
 
 def require_that(what: str, holds: Callable[..., Any], *values: Any) -> None:
-    """Raise `ValueError` unless a condition on the arrays of some values holds everywhere.
-
-    Args:
-        what: what must hold, in words.
-        holds: the condition, by operators and methods that NumPy's and JAX's arrays have both.
-        values: its arguments.
-    """
+    """Raise `ValueError` unless a condition on the arrays of some values holds everywhere, which `what` says in
+    words. It is made of operators and methods that NumPy's and JAX's arrays have both."""
     if is_traced(values):
         if (gathered := _put_off.get()) is not None:
             gathered.append(Requirement(f"{what}.", lambda: holds(*map(jnp.asarray, values))))
@@ -136,11 +126,7 @@ def as_plain(value: Any) -> Any:
 
 def require_placement(tree: Any) -> None:
     """Refuse arrays that carry placements which neither loops nor compiled sums support: manual axes over which they
-    vary, as within a `jax.shard_map` that checks them, or explicit axes over which they are divided.
-
-    Raises:
-        ValueError: one does.
-    """
+    vary, as within a `jax.shard_map` that checks them, or explicit axes over which they are divided."""
     for leaf in jax.tree.leaves(tree):
         while isinstance(leaf, jax.Array):
             kind = jax.typeof(leaf)
@@ -240,17 +226,9 @@ def canonical(tree: Any, dtype: Any) -> Any:
 
 
 def require_memory(what: str, needed: float | int, advice: str, *, device: bool = False) -> None:
-    """Check that what will be allocated fits into the available memory.
-
-    Args:
-        what: what it is, as the subject of "takes at least so many GB".
-        needed: how many bytes it takes at least.
-        advice: which number to change.
-        device: whether it lies on jax's device.
-
-    Raises:
-        ValueError: it does not.
-    """
+    """Raise a `ValueError` if what will be allocated, `needed` bytes at least, of jax's `device` or the host, does
+    not fit into the available memory. `what` is the subject of "takes at least so many GB", `advice` says which
+    number to change."""
     if needed < 2**26:  # asking takes longer
         return
     there = available_memory(device=device)

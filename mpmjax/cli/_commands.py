@@ -24,7 +24,6 @@ from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation,
 from mpmjax.fitting import (
     Experiment,
     FitProblem,
-    FitResult,
     Profile,
     fit,
     fit_multistart,
@@ -51,7 +50,7 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
         try:
             with jax.enable_x64(True), warnings.catch_warnings():
                 warnings.simplefilter("default", UserWarning)
-                warnings.showwarning = _print_warning
+                warnings.showwarning = lambda message, *_: _print_error(f"warning: {' '.join(str(message).split())}")
                 command(*args, **kwargs)
         except typer.Exit:  # a RuntimeError too
             raise
@@ -61,12 +60,6 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(2) from None
 
     return guarded
-
-
-def _print_warning(message: Warning | str, *where: Any) -> None:
-    """Print a warning in one line, without the place in the code."""
-    del where
-    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 MostSeconds = Annotated[
@@ -229,7 +222,14 @@ def fit_command(
     begun = time.perf_counter()
     require(log is not None or not resume, "--resume continues the fit of a log: name it by --log.")
     asked = read_fit(scene, lambda file: _chosen(file, most_seconds))
-    grids = asked.refine if refine is None else _grids(refine)
+    grids = asked.refine
+    if refine is not None:
+        try:
+            numbers = tuple(int(part) for part in refine.split(","))
+        except ValueError:
+            text = shortened(refine, 20)
+            raise ValueError(f"--refine must be whole numbers with commas, such as 2, got {text!r}.") from None
+        grids = refinements(numbers, "--refine")
     if grids:
         asked.refined(grids[-1])  # a grid that cannot be is refused before the first fit
     plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
@@ -258,27 +258,21 @@ def fit_command(
             fits, whole = (outcome,), asked.whole
         print(outcome)
         result, iterations = fits[-1], sum(len(each.history) for each in fits)
-        drawn = _profiles(result, profiles, progress)
+        drawn: list[Profile] = []  # after a signal those that are done
+        wanted = [] if result.interrupted else profiles or []
+        try:
+            for name in wanted:
+                drawn.append(profile(result, name, progress=progress))
+        except KeyboardInterrupt:
+            _print_error(f"{len(drawn)} of {len(wanted)} profiles are done.")
     for each in drawn:
         print(each)
     print(f"{iterations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all", flush=True)
-    report = whole, drawn, predict_observations(result, whole)
+    report = whole, tuple(drawn), predict_observations(result, whole)
     numbers = write_fit(outcome, plot.with_suffix(".json"), *report)
     print(f"written {draw_fit(result, plot, *report)} and {numbers}")
     if stop.signal or result.interrupted:
         raise typer.Exit(128 + (stop.signal or signal.SIGINT))
-
-
-def _profiles(result: FitResult, names: list[str] | None, progress: Callable[[str], None]) -> tuple[Profile, ...]:
-    """The profiles that were asked for; after a signal those that are done."""
-    wanted = [] if result.interrupted else names or []
-    profiles: list[Profile] = []
-    try:
-        for name in wanted:
-            profiles.append(profile(result, name, progress=progress))
-    except KeyboardInterrupt:
-        _print_error(f"{len(profiles)} of {len(wanted)} profiles are done.")
-    return tuple(profiles)
 
 
 def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> FitFile:
@@ -305,17 +299,6 @@ def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> Fit
 
     parameters = staged.result.restarted(asked.parameters)
     return asked._replace(parameters=parameters, experiments=until(asked.experiments), refined=refined)
-
-
-def _grids(text: str) -> tuple[int, ...]:
-    """The grids that --refine names."""
-    try:
-        numbers = tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(
-            f"--refine must be whole numbers with commas, such as 2, got {shortened(text, 20)!r}."
-        ) from None
-    return refinements(numbers, "--refine")
 
 
 @app.command("chart")

@@ -15,7 +15,6 @@ import numpy as np
 from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
 from mpmjax.checks import require, require_positive, shortened, warn
-from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractRegion
 from mpmjax.io import arguments, decode, reason
 from mpmjax.simulation import number_of_steps
@@ -56,8 +55,8 @@ class SceneFile(NamedTuple):
     scene: Scene
     particles: Particles
     run: RunSettings
-    fit: dict[str, Any] | None  # the `[fit]` table, not read yet; None without one
-    build: Build  # makes the scene and its particles on n times as many cells a direction, from n
+    fit: dict[str, Any] | None
+    build: Build
 
 
 class Simulation(NamedTuple):
@@ -75,13 +74,15 @@ class Simulation(NamedTuple):
 
 
 def read_scene_file(path: Path) -> SceneFile:
-    """Read a scene file.
-
-    Raises:
-        ValueError: no such file, no TOML, a key that is unknown, missing or unfit, particles outside of the window: one
-            line that names the place.
-    """
-    table = _toml(path)
+    """Read a scene file; a ValueError says in one line which key is unknown, missing or unfit, and where."""
+    try:
+        table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"Cannot read the scene file {path}: {reason(error).lower()}.") from None
+    except RecursionError:
+        raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
+    except ValueError as error:  # TOML's and UTF-8's among them
+        raise ValueError(f"{path} is not a TOML file: {shortened(str(error))}.") from None
     for name in ("particles", "run"):
         require(name in table, f"{path}: needs the table [{name}]. See docs/scene_files.md.")
     fit_table = table.pop("fit", None)
@@ -89,7 +90,14 @@ def read_scene_file(path: Path) -> SceneFile:
     groups, run_table = table.pop("particles"), table.pop("run")
     groups = groups if isinstance(groups, list) else [groups]
     try:
-        run = _run_settings(run_table)
+        require(isinstance(run_table, dict), f"[run] must be a table, got {shortened(repr(run_table))}.")
+        auto = {name for name in ("dt", "method") if run_table.get(name) == "auto"}
+        require("dt" in run_table, '[run] needs the key \'dt\': a step in seconds, "stable" or "auto".')
+        both = '[run] method = "auto" goes with dt = "auto": the cheapest of both is chosen together.'
+        require(auto != {"method"}, both)
+        settings: dict[str, Any] = {} if "method" in auto else {"method": Explicit()}
+        settings |= arguments(RunSettings, {k: v for k, v in run_table.items() if k not in auto}, "[run]")
+        run = RunSettings(**settings)
 
         def build(n: int) -> tuple[Scene, Particles]:
             scene = decode(_refined(table, n), Scene)
@@ -114,17 +122,8 @@ def read_simulation(
     progress: Callable[[Trial], None] = lambda trial: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Simulation:
-    """Read a scene file, and resolve its "stable" step or what it leaves to pilot runs by "auto".
-
-    Args:
-        path: the file.
-        most_seconds: what the pilot runs may take [s]. Default: what the file says.
-        progress: called with each pilot run, see `work_precision`.
-        say: called with each run of their reference.
-
-    Raises:
-        ValueError: as `read_scene_file`, and as `stable_dt` and `work_precision`.
-    """
+    """Read a scene file, and resolve its "stable" step or what it leaves to pilot runs by "auto", within
+    `most_seconds` or what the file says. `progress` and `say` are those of `work_precision`."""
     file = read_scene_file(path)
     run, choice = file.run, None
     t1, dt, method, save_every = run.t1, run.dt, run.method, run.save_every
@@ -166,28 +165,6 @@ def stable_step(path: Path, file: SceneFile) -> float:
         raise ValueError(f'{path}: [run] dt = "stable": {error}') from None
 
 
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"Cannot read the scene file {path}: {reason(error).lower()}.") from None
-    except RecursionError:
-        raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
-    except ValueError as error:  # TOML's and UTF-8's among them
-        raise ValueError(f"{path} is not a TOML file: {shortened(str(error))}.") from None
-
-
-def _run_settings(table: Any) -> RunSettings:
-    require(isinstance(table, dict), f"[run] must be a table, got {shortened(repr(table))}.")
-    left = {name for name in ("dt", "method") if table.get(name) == "auto"}
-    require("dt" in table, '[run] needs the key \'dt\': a step in seconds, "stable" or "auto".')
-    require(left != {"method"}, '[run] method = "auto" goes with dt = "auto": the cheapest of both is chosen together.')
-    settings = arguments(RunSettings, {key: value for key, value in table.items() if key not in left}, "[run]")
-    if "method" not in left:
-        settings.setdefault("method", Explicit())
-    return RunSettings(**settings)
-
-
 def _refined(table: dict[str, Any], n: int) -> dict[str, Any]:
     """The table of a scene on n times as many cells a direction."""
     grid = table.get("grid")
@@ -212,6 +189,8 @@ def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
     filled: list[list[Particles]] = [[] for _ in scene.laws]
     regions: list[AbstractRegion] = []
     placed: list[np.ndarray] = []
+    grid, dx = scene.grid, float(scene.grid.spacing)
+    window, first, held = np.asarray(grid.shape) - 1, np.asarray(grid.origin) * dx, ~np.asarray(grid.periodic)
     for number, table in enumerate(tables, 1):
         where = f"[[particles]] {number}"
         require(isinstance(table, dict), f"{where} must be a table, got {shortened(repr(table))}.")
@@ -223,46 +202,33 @@ def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
             f"{shortened(repr(material))}.",
         )
         keys = arguments(fill, rest, where, without=("grid", "dtype"))
+        region: AbstractRegion = keys["region"]
         try:
-            _check_place(keys["region"], scene.grid)
-            filled[material - 1].append(fill(grid=scene.grid, dtype=dtype, **keys))
-            regions, placed = [*regions, keys["region"]], [*placed, np.asarray(filled[material - 1][-1].x)]
+            lower, upper = region.bounds()
+            if len(lower) == grid.dim:  # else `fill` refuses it
+                too_large = (upper - lower > (window + 2) * dx) & held
+                beside = ((upper < first) | (lower > first + window * dx)) & held & (not grid.follow)
+                require(
+                    ~(too_large | beside),
+                    f"the region from {lower} to {upper} m does not fit into the grid's window, of {window * dx} m"
+                    + ("" if grid.follow else f" from {first} m")
+                    + ": all lengths are in metres; enlarge the shape, move the origin, or use follow = true.",
+                )
+            filled[material - 1].append(fill(grid=grid, dtype=dtype, **keys))
+            regions, placed = [*regions, region], [*placed, np.asarray(filled[material - 1][-1].x)]
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
-    _warn_of_overlaps(regions, placed, float(scene.grid.spacing))
-    for number, sets in enumerate(filled, 1):
-        require(
-            len(sets) > 0, f"[[material]] {number} has no particles: name it in a [[particles]] table, or leave it out."
-        )
-    return join(*(replace(join(*sets), counts=None) for sets in filled))
-
-
-def _warn_of_overlaps(regions: list[AbstractRegion], placed: list[np.ndarray], spacing: float) -> None:
-    """Warn where particles of a table lie in the region of an earlier one, deeper than rounding has it."""
     for (i, region), (j, x) in itertools.product(enumerate(regions, 1), enumerate(placed, 1)):
         lower, upper = region.bounds()
         if i < j and ((x.min(axis=0) < upper) & (x.max(axis=0) > lower)).all():
-            inside = int(np.asarray(region.contains(jnp.asarray(x), -1e-3 * spacing)).sum())
+            inside = int(np.asarray(region.contains(jnp.asarray(x), -1e-3 * dx)).sum())  # deeper than rounding has it
             if inside:
                 warn(
                     f"{inside} particles of [[particles]] {j} lie in the region of [[particles]] {i}: where two fill "
                     "the same place there is twice the mass."
                 )
-
-
-def _check_place(region: AbstractRegion, grid: Grid) -> None:
-    """Refuse a region larger than the window or beside it, before it is filled."""
-    lower, upper = region.bounds()
-    if len(lower) != grid.dim:
-        return  # as `fill` says
-    dx, window = float(grid.spacing), np.asarray(grid.shape) - 1
-    first = np.asarray(grid.origin) * dx
-    held = ~np.asarray(grid.periodic)
-    too_large = (upper - lower > (window + 2) * dx) & held
-    beside = ((upper < first) | (lower > first + window * dx)) & held & (not grid.follow)
-    require(
-        ~(too_large | beside),
-        f"the region from {lower} to {upper} m does not fit into the grid's window, of {window * dx} m"
-        + ("" if grid.follow else f" from {first} m")
-        + ": all lengths are in metres; enlarge the shape, move the origin, or use follow = true.",
-    )
+    for number, sets in enumerate(filled, 1):
+        require(
+            len(sets) > 0, f"[[material]] {number} has no particles: name it in a [[particles]] table, or leave it out."
+        )
+    return join(*(replace(join(*sets), counts=None) for sets in filled))

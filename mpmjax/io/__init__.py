@@ -1,8 +1,7 @@
 """Runs, scenes and tables in files."""
 
-from mpmjax.io._hdf5 import check_hdf5 as check_hdf5, check_place as check_place
-from mpmjax.io._record import record as record
-from mpmjax.io._runs import load as load, save as save, steps_in as steps_in
+from mpmjax.io._run_file import check_hdf5 as check_hdf5, check_place as check_place, steps_in as steps_in
+from mpmjax.io._runs import load as load, record as record, save as save
 from mpmjax.io._schema import arguments as arguments, decode as decode, register as register
 from mpmjax.io._transactional_file import (
     ReplacedFile as ReplacedFile,

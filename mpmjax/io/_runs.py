@@ -1,6 +1,6 @@
 """Runs in files: HDF5 that ParaView opens as it is, and from which a run continues bit for bit.
 
-    /VTKHDF     the frames (see `_run_contents`): Points, and as PointData velocity, deformation_gradient, J = det F,
+    /VTKHDF     the frames (see `_run_file`): Points, and as PointData velocity, deformation_gradient, J = det F,
                 with APIC affine_velocity, and what laws that yield remember
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
                 `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
@@ -15,50 +15,68 @@ A file is read only if it holds all of its data itself: HDF5 follows links to ot
 """
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
-import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
+from mpmjax._types import Scalar
 from mpmjax.boundary import Impulses
-from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_memory, require_positive
-from mpmjax.io._hdf5 import (
-    LIBVER_HEAD,
+from mpmjax.checks import (
+    canonical,
+    checked,
+    is_traced,
+    require,
+    require_memory,
+    require_whole,
+    requirements,
+)
+from mpmjax.io._run_file import (
     File,
     check_hdf5,
-    check_no_writer,
+    check_numbers,
     check_place,
+    check_same,
     checksum,
     count_in,
+    created,
+    describe,
+    description_in,
     frame_rows,
     opened,
     reading,
     require_of_file,
-    set_count,
-)
-from mpmjax.io._run_contents import (
-    add_growing,
-    add_topology,
-    check_readable,
-    check_same,
-    describe,
-    description_in,
     rows_of,
+    set_count,
     states_in,
-    write_description,
 )
 from mpmjax.io._schema import decode
-from mpmjax.io._transactional_file import StagedFile, reason, replacing, staged_file, undisturbed
-from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, no_steps
-from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
-from mpmjax.stepping import AbstractIntegrator
+from mpmjax.io._transactional_file import StagedFile, reason, replacing, reporting, staged_file, undisturbed
+from mpmjax.simulation import (
+    Fault,
+    RolloutState,
+    Run,
+    RunStatistics,
+    SimulationError,
+    initial_state,
+    no_steps,
+    number_of_steps,
+    raise_faults,
+    run_to,
+    segment,
+    warn_of_inaccuracy,
+)
+from mpmjax.state import Particles, Scene, prepare, state_of
+from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
 
 _IMPULSES = ("collider_impulse", "boundary_impulse")
 
@@ -83,14 +101,8 @@ class FrameWriter:
         start: int = 0,
         overwrite: bool = False,
     ) -> "FrameWriter":
-        """Begin a file with prepared particles as its first frame, of step `start`. It takes its place when that is on
-        the disk.
-
-        Raises:
-            ValueError: a file that is there, and with `overwrite` one that is no run or is being written; a place that
-                cannot be written; an object that files cannot hold.
-            OSError: the disk has no room for it; what was there is there.
-        """
+        """Begin a file with prepared particles as its first frame, of step `start`. It takes its place when that is
+        on the disk; whatever is wrong before leaves what was there."""
         path = Path(path)
         check_place(path, overwrite=overwrite)
         with undisturbed():
@@ -102,13 +114,8 @@ class FrameWriter:
     def resume(
         cls, path: str | os.PathLike, scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any
     ) -> "FrameWriter":
-        """Open a file to append frames to it, after checking that it is whole and of the same run. Frames that a killed
-        writer left incomplete are cut off.
-
-        Raises:
-            ValueError: see `load`; a file that is being written; a scene, particles, method or dt that differ from the
-                file's.
-        """
+        """Open a file to append frames to it, after checking that it is whole, of the same run, and not being
+        written. Frames that a killed writer left incomplete are cut off."""
         path = Path(path)
         described = describe(scene, particles, method, dt)
         begin = initial_state(scene, particles)
@@ -137,10 +144,7 @@ class FrameWriter:
 
     def append(self, step: int, state: RolloutState, statistics: RunStatistics) -> None:
         """Write the frame of a step, with impulses and statistics by then; one of the last frame's step replaces it.
-
-        Raises:
-            OSError: the disk refused. The file is what it was before, and this writer can only be closed.
-        """
+        If the disk refuses, an OSError: the file is what it was, and this writer can only be closed."""
         file, n = self._file, count_in(self._file)
         if n and file["mpmjax/frames"][n - 1]["step"] == step:
             n -= 1
@@ -206,21 +210,112 @@ class FrameWriter:
 @contextmanager
 def _new(path: Path, scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any) -> Iterator[FrameWriter]:
     """A writer of a new file, without frames, which is at `path` when the block has ended without an error."""
-    described = describe(scene, particles, method, dt)
-    check_readable(path, described)
-    begin = initial_state(scene, particles)
+    described, begin = describe(scene, particles, method, dt), initial_state(scene, particles)
+    rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
     with replacing(path) as aside, staged_file(aside) as staged:
-        h5py.File(staged, "w", libver=LIBVER_HEAD).close()
-        file = opened(staged, aside)
-        add_topology(file, particles.count)
-        file.create_group("mpmjax/arrays")
-        for name, data in _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype)).items():
-            add_growing(file, name, data)
-        write_description(file["mpmjax"], described)
+        file = created(staged, path, described, rows)
         file.flush()
         staged.commit()
         with FrameWriter(file, staged, aside, begin) as writer:
             yield writer
+
+
+@checked
+def record(
+    path: str | os.PathLike,
+    scene: Scene,
+    particles: Particles,
+    *,
+    t1: Scalar,
+    dt: Scalar | Literal["stable"],
+    method: AbstractIntegrator = Explicit(),
+    save_every: int,
+    start: int = 0,
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: bool = False,
+) -> Run:
+    """Simulate as `simulate` does, writing each frame to a file when it is reached; memory holds one frame only.
+
+    The steps between two frames are one compiled program, called again and again, and give the same numbers as
+    `simulate` with the same `save_every`, bit for bit on a CPU. A run that is interrupted or meets a fault leaves a
+    whole file.
+
+    Args:
+        path: the file to be (see `save`).
+        scene, t1, dt, method: as in `simulate`.
+        particles: the particles at step `start`; when resuming, those the recorded run began with.
+        save_every: write a frame at the start, every so many steps, and at the end.
+        start: number of the first step. Not used when resuming.
+        overwrite: replace a file that is there.
+        resume: continue from the last frame in the file up to t1. Where that is reached already, nothing is done.
+        progress: show a progress bar on standard error.
+
+    Returns:
+        the run without its frames, which are in the file.
+
+    Raises:
+        ValueError: those of `simulate` and `load`; a file that is there, of another run, or being written.
+        SimulationError: those of `simulate`; the last good state is in the file.
+        OSError: the disk refused a frame, as when it is full. The file holds all frames before it and can be resumed.
+    """
+    start = 0 if resume else require_whole("start", start, 0)
+    requirements(method)
+    particles = prepare(scene, particles)
+    dt = step_for(scene, particles, t1, dt, method, start)
+    end = start + number_of_steps(t1, dt, start, particles.x.dtype)
+    save_every = min(require_whole("save_every", save_every, 1), end - start)
+    if resume:
+        writer = FrameWriter.resume(path, scene, particles, method, dt)
+    else:
+        writer = FrameWriter.create(path, scene, particles, method, dt, start=start, overwrite=overwrite)
+    scene, dt_, method = canonical((scene, dt, method), particles.x.dtype)
+    with writer:
+        step, state, statistics = writer.last()
+        start = step - int(statistics.steps)
+        require(
+            int(statistics.fault) == Fault.NONE,
+            f"{path} ends with a fault after step {step} and would meet it again: start anew with another dt or scene.",
+        )
+        bar = tqdm(initial=step, total=max(step, end), unit="step", file=sys.stderr, disable=not progress)
+
+        def stopped() -> str:
+            bar.close()
+            return writer.standing("Resume it to continue.")
+
+        def append(step: int, state: RolloutState, statistics: RunStatistics) -> None:
+            try:
+                writer.append(step, state, statistics)
+            except OSError as error:
+                raise OSError(f"{error}. {writer.standing('Make room, then resume it.')}") from None
+
+        with bar, reporting(stopped):
+            healthy = True
+            before: Callable[[], RolloutState] = partial(initial_state, scene, particles)
+            while healthy and step < end:
+                count = min(save_every - (step - start) % save_every, end - step)
+                state, new, before = segment(scene, particles, state, step, count, dt_, method, max_steps=save_every)
+                statistics, step = statistics.merged(new), step + int(new.steps)
+                healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
+                if healthy:
+                    append(step, state, statistics)
+                    bar.update(count)
+        run = run_to(state, step, statistics, scene, particles, dt_, method)
+        try:
+            raise_faults(run, particles, before, start)
+        except SimulationError as error:
+            good = error.run
+            last = RolloutState(state_of(good.final), good.final_collider_impulse, good.final_boundary_impulse)
+            try:
+                append(int(good.final_step), last, statistics)
+                resumable = int(statistics.fault) == Fault.NONE
+                again = "It can be resumed as it is." if resumable else "Resumed it would end there again: begin anew."
+                text = writer.standing(again)
+            except OSError as refused:
+                text = str(refused)
+            raise SimulationError(f"{error} {text}", good) from None
+        warn_of_inaccuracy(run)
+        return run
 
 
 @checked
@@ -243,7 +338,7 @@ def save(path: str | os.PathLike, run: Run) -> None:
     count = int((np.asarray(run.steps) < final_step).sum())  # beyond it lie frames of a run that met a fault
     steps, frames = jax.tree.map(lambda a: a[:count], (np.asarray(run.steps), run.frames))
     states = (state_of(run.final),) if frames is None else (frames, state_of(run.final))
-    _check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
+    check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
     unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.statistics)
     with _new(path, run.scene, run.final, run.method, run.dt) as writer:
         for i in range(count):
@@ -251,15 +346,6 @@ def save(path: str | os.PathLike, run: Run) -> None:
             writer.append(int(steps[i]), RolloutState(*frame), unknown)
         received = run.final_collider_impulse, run.final_boundary_impulse
         writer.append(final_step, RolloutState(state_of(run.final), *received), run.statistics)
-
-
-def steps_in(path: str | os.PathLike) -> int:
-    """How many steps led to the last frame of a file, −1 if that is not known. Raises what `load` does, and for a file
-    that is being written."""
-    check_no_writer(Path(path))
-    with reading(Path(path)) as file:
-        require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
-        return int(file["mpmjax/frames"][count_in(file) - 1]["steps"])
 
 
 @checked
@@ -284,28 +370,25 @@ def load(path: str | os.PathLike) -> Run:
         scene = decode(described["scene"], Scene, "scene", arrays)
         method = decode(described["method"], AbstractIntegrator, "method", arrays)
         scene, method = canonical((scene, method), dtype)
-        parts = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
-        parts_of_run: dict[str, Any] = parts
-        blank = jnp.zeros((len(parts_of_run["mass"]), scene.grid.dim), dtype)
-        particles = Particles(blank, blank, **parts_of_run, counts=described["counts"])
+        parts: dict[str, Any] = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
+        blank = jnp.zeros((len(parts["mass"]), scene.grid.dim), dtype)
+        particles = Particles(blank, blank, **parts, counts=described["counts"])
         like = jax.eval_shape(lambda: initial_state(scene, prepare(scene, particles)))
         steps, frames, tallies = _frames(file, like, 0, count_in(file))
-        _check_numbers(scene, described["dt"], steps, frames.particles)
+        check_numbers(scene, described["dt"], steps, frames.particles)
     last = jax.tree.map(lambda a: a[-1], frames)
-    return Run(
-        scene=scene,
-        method=method,
-        dt=jnp.asarray(described["dt"], dtype),
+    return run_to(
+        last,
+        steps[-1],
+        jax.tree.map(lambda a: a[-1], tallies),
+        scene,
+        particles,
+        jnp.asarray(described["dt"], dtype),
+        method,
         steps=jnp.asarray(steps, dtype),
         frames=frames.particles,
-        observed=None,
-        final=with_state(particles, last.particles),
-        final_step=jnp.asarray(steps[-1], dtype),
-        statistics=jax.tree.map(lambda a: a[-1], tallies),
         collider_impulse=frames.collider_impulse,
-        final_collider_impulse=last.collider_impulse,
         boundary_impulse=frames.boundary_impulse,
-        final_boundary_impulse=last.boundary_impulse,
     )
 
 
@@ -331,17 +414,4 @@ def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.n
         if getattr(like, name) is not None:
             both = jnp.asarray(rows[f"mpmjax/{name}"])
             received[name] = Impulses(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
-    kept = (received.get(name) for name in _IMPULSES)
-    return table["step"], RolloutState(states_in(rows, like.particles), *kept), tallies
-
-
-def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
-    """Check that the step is positive, step numbers grow, states are finite, and positions are ones that a grid can
-    number."""
-    require_positive("dt [s]", dt)
-    require(steps[0] >= 0 and (np.diff(steps) > 0).all(), f"A run's steps must grow from 0 or later, got {steps}.")
-    most = float(scene.grid.spacing) * 2**31  # as far as nodes are numbered
-    for state in states:
-        for leaf in jax.tree.leaves(state):
-            require_finite("A run's frames", leaf)
-        require(np.abs(state.x).max(initial=0) < most, f"Positions must be below {most:.3g} m.")
+    return table["step"], RolloutState(states_in(rows, like.particles), **received), tallies

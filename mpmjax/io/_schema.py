@@ -29,8 +29,7 @@ from mpmjax.checks import alternatives, choices, is_enum, is_module, is_own, may
 from mpmjax.state import Scene
 from mpmjax.stepping import AbstractIntegrator
 
-_registered: dict[str, type] = {}
-"""The registered classes that files can hold, by name."""
+_registered: dict[str, type] = {}  # the registered classes that files can hold, by name
 
 Registered = TypeVar("Registered", bound=type)
 
@@ -100,16 +99,12 @@ def _can_be_held(hint: Any) -> bool:
     """Whether some value of an annotation can stand in a file."""
 
     def can(a: Any) -> bool:
+        if is_module(a):  # made of its fields; those of `equinox.nn` are made of sizes and a key
+            return inspect.isabstract(a) or set(_parameters(a)) <= {f.name for f in fields(a)}
         items = get_args(a) if get_origin(a) in (tuple, list) else ()
-        return is_enum(a) or _is_made_of_fields(a) or any(_can_be_held(item) for item in items if item is not Ellipsis)
+        return is_enum(a) or any(_can_be_held(item) for item in items if item is not Ellipsis)
 
     return bool(_forms(hint)) or any(can(a) for a in alternatives(hint))
-
-
-def _is_made_of_fields(cls: Any) -> bool:
-    """Whether an annotation is a class of modules that is made of its fields. Those of `equinox.nn` are made of sizes
-    and a key."""
-    return is_module(cls) and (inspect.isabstract(cls) or set(_parameters(cls)) <= {f.name for f in fields(cls)})
 
 
 _SMALL = 64  # most numbers that are written out, and that are read as a tuple where both are taken
@@ -119,17 +114,9 @@ _MANY = {float: "numbers", int: "whole numbers", bool: "true and false", str: "s
 
 
 def encode(value: Any, arrays: dict[str, np.ndarray] | None = None, path: str = "") -> Any:
-    """An object as plain data: dict, list, float, int, bool and str.
-
-    Args:
-        value: an object of the package, a number, an array, or a tuple of such.
-        arrays: takes arrays of more than 64 numbers, each under its dotted path; {"array": path} stands in their place.
-            Without it they are written out like any other.
-        path: dotted path of the value.
-
-    Raises:
-        ValueError: an object whose class is neither the package's own nor registered.
-    """
+    """An object at a dotted path as plain data: dict, list, float, int, bool and str. `arrays` takes those of more
+    than 64 numbers, each under its path; {"array": path} stands in their place. A ValueError names a class that is
+    neither the package's own nor registered."""
     match value:
         case _ if type(value) in _known():
             parts = {name: getattr(value, name) for name in _parameters(type(value))}
@@ -155,28 +142,41 @@ def encode(value: Any, arrays: dict[str, np.ndarray] | None = None, path: str = 
 
 
 def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarray] | None = None) -> Any:
-    """The object that plain data describe.
-
-    Args:
-        data: what `encode` returns, or a table of a TOML file.
-        expected: the class, abstract class or union that it must be of; also any annotation of numbers.
-        where: the place in the file that errors name, e.g. "[material]"; empty for the whole file.
-        arrays: the arrays that `encode` put aside.
-
-    Raises:
-        ValueError: an unknown, missing or unfit key, an unknown kind, or what the constructor refuses: one line that
-            names the place.
-    """
+    """The object that plain data describe, those of `encode` or a table of a TOML file. `expected` is the class,
+    abstract class, union or annotation of numbers that it must be of, `where` the place in the file that errors
+    name, such as "[material]", `arrays` what `encode` put aside. A ValueError says in one line what is unknown,
+    missing or unfit, or what the constructor refuses."""
     options = alternatives(expected)
     fitting = (c for c in _known() if any(is_module(a) and issubclass(c, a) for a in options))
     classes = {c.__name__: c for c in sorted(fitting, key=lambda c: c.__name__)}
     items = [get_args(a)[0] for a in options if get_origin(a) in (tuple, list)]
     if items and isinstance(data, list) and (classes or not _forms(expected)):  # of objects, or of arrays
-        return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
+        *outer, header = where.split(" ")  # of one of a list of tables it is that of the list in further brackets
+        nth = " ".join([*outer, f"[{header}]"])
+        return tuple(decode(d, items[0], f"{nth} {i}", arrays) for i, d in enumerate(data, 1))
     number = isinstance(data, (int, float)) and not isinstance(data, bool) and (float, 0) in _forms(expected)
     if any(is_module(a) for a in options) and not number:
+        table: Any = {"kind": data} if isinstance(data, str) else data
+        opened = any(inspect.isabstract(a) for a in options)  # to classes that are registered
+        _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
+        choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
+        # where no kind is given, the one class that is named by itself beside base classes, or the package's only one
         plain = [a.__name__ for a in options if is_module(a) and not inspect.isabstract(a)]
-        return _object(data, classes, any(inspect.isabstract(a) for a in options), where, arrays, plain)
+        evident = plain if len(plain) == 1 else [name for name, c in classes.items() if is_own(c)]
+        _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
+        _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
+        kind = table.get("kind", *evident) if len(evident) == 1 else table["kind"]
+        if not (isinstance(kind, str) and kind in classes):
+            more = (
+                " A class of your own is known when the module is imported that calls mpm.register." if opened else ""
+            )
+            named = f"{_named(where, 'unknown kind')} {_short(kind)}{_close(_short(kind), classes)}"
+            raise ValueError(f"{named} It must be {choice}.{more * opened}")
+        keywords = arguments(classes[kind], {k: v for k, v in table.items() if k != "kind"}, where, arrays)
+        try:
+            return classes[kind](**keywords)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}" if where else str(error)) from None
     if enums := [a for a in options if is_enum(a)]:
         words = [member.value for member in enums[0]]
         listed = ", ".join(map(repr, words))
@@ -188,52 +188,26 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
 def arguments(
     function: Callable, table: Any, where: str, arrays: dict[str, np.ndarray] | None = None, without: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """The keyword arguments of a function (or class) that a table describes, `without` those that it has otherwise.
-
-    Raises:
-        ValueError: see `decode`.
-    """
+    """The keyword arguments of a function (or class) that a table describes (see `decode`), `without` those that it
+    has otherwise."""
     _require(isinstance(table, dict), where, f"must be a table, got {_short(table)}")
     parameters = {name: p for name, p in _parameters(function).items() if name not in without}
     for key in table:
         if key not in parameters:
-            close = difflib.get_close_matches(key[:60], parameters, 1)
-            hint = f", did you mean {close[0]!r}?" if close else "."
+            hint = _close(key[:60], parameters)
             raise ValueError(
                 f"{_named(where, 'unknown key')} {_short(key)}{hint} Known here: {', '.join(parameters) or 'none'}."
             )
     for name, (_, default) in parameters.items():
         _require(name in table or default is not inspect.Parameter.empty, where, f"needs the key {name!r}")
-    return {key: decode(value, parameters[key][0], _inside(where, key, value), arrays) for key, value in table.items()}
 
+    def inside(key: str, value: Any) -> str:  # a table has a header, anything else is named after that which it is in
+        tables = value if isinstance(value, list) and value else [value]
+        if not all(isinstance(v, dict) and set(v) != {"array"} for v in tables):
+            return f"{where} {key}".strip()
+        return f"{where[:-1]}.{key}]" if where.endswith("]") else f"{where} [{key}]".strip()
 
-def _object(
-    data: Any,
-    classes: dict[str, type],
-    opened: bool,
-    where: str,
-    arrays: dict[str, np.ndarray] | None,
-    plain: list[str],
-) -> Any:
-    """The table of an object that may be of one of several classes; where `opened` also of one that is registered.
-    Where one of them is `plain`, named by itself beside a base class, it is meant where no kind is given."""
-    table = {"kind": data} if isinstance(data, str) else data
-    _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
-    choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
-    evident = plain if len(plain) == 1 else [name for name, c in classes.items() if is_own(c)]
-    _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
-    _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
-    kind = table.get("kind", *evident) if len(evident) == 1 else table["kind"]
-    if not (isinstance(kind, str) and kind in classes):
-        close = difflib.get_close_matches(_short(kind), classes, 1)
-        hint = f", did you mean {close[0]!r}?" if close else "."
-        more = " A class of your own is known when the module is imported that calls mpm.register." if opened else ""
-        raise ValueError(f"{_named(where, 'unknown kind')} {_short(kind)}{hint} It must be {choice}.{more}")
-    keywords = arguments(classes[kind], {k: v for k, v in table.items() if k != "kind"}, where, arrays)
-    try:
-        return classes[kind](**keywords)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}" if where else str(error)) from None
+    return {key: decode(value, parameters[key][0], inside(key, value), arrays) for key, value in table.items()}
 
 
 def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray] | None) -> Any:
@@ -342,20 +316,9 @@ def _nested(data: Any, of_list: type, of_leaf: Callable[[Any], Any]) -> Any:
     return of_list(_nested(d, of_list, of_leaf) for d in data) if isinstance(data, list) else of_leaf(data)
 
 
-def _inside(where: str, key: str, value: Any) -> str:
-    """The place of a key: a table has a header of its own, anything else is named after the table it stands in."""
-    tables = value if isinstance(value, list) and value else [value]
-    if not all(isinstance(v, dict) and set(v) != {"array"} for v in tables):
-        return f"{where} {key}".strip()
-    if not where:
-        return f"[{key}]"
-    return f"{where[:-1]}.{key}]" if where.endswith("]") else f"{where} [{key}]"
-
-
-def _nth(where: str, i: int) -> str:
-    """The place of one of a list of tables: its header is that of the list with another pair of brackets."""
-    *outer, header = where.split(" ")
-    return " ".join([*outer, f"[{header}]", str(i)])
+def _close(word: str, words: Iterable[str]) -> str:
+    close = difflib.get_close_matches(word, words, 1)
+    return f", did you mean {close[0]!r}?" if close else "."
 
 
 def _named(where: str, what: str) -> str:

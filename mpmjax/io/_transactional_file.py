@@ -63,12 +63,9 @@ def reporting(report: Callable[[], str]) -> Iterator[None]:
 class Stop:
     """A request to stop in good order."""
 
-    what: str
-    """A sentence on what is done about it."""
-    ready: bool = False
-    """Whether there is anything to keep; as long as not, a signal ends the process at once."""
-    signal: int = 0
-    """Number of the signal that came; zero if none did."""
+    what: str  # a sentence on what is done about it
+    ready: bool = False  # whether there is anything to keep; as long as not, a signal ends the process at once
+    signal: int = 0  # number of the signal that came; zero if none did
 
 
 @contextmanager
@@ -99,9 +96,14 @@ def end_on_signals() -> None:
 
 
 def _wait(woken: socket.socket, told: dict[int, str]) -> None:
-    number = 0
-    while number not in told or _postponed(number, told[number]):
-        number = woken.recv(1)[0]
+    while True:
+        if (number := woken.recv(1)[0]) not in told:
+            continue
+        stop = next((s for s in list(_stops) if s.ready and not s.signal), None)
+        if stop is None:
+            break
+        stop.signal = number  # and the process is left to stop in good order
+        os.write(2, f"mpmjax: {told[number]}. {stop.what}\n".encode())
     with undisturbed():
         printed = threading.Thread(target=sys.stdout.flush, daemon=True)  # it may wait for whoever reads
         printed.start()
@@ -111,24 +113,10 @@ def _wait(woken: socket.socket, told: dict[int, str]) -> None:
         os._exit(128 + number)
 
 
-def _postponed(number: int, told: str) -> bool:
-    """Whether the process is left to stop in good order."""
-    for stop in list(_stops):
-        if stop.ready and not stop.signal:
-            stop.signal = number
-            os.write(2, f"mpmjax: {told}. {stop.what}\n".encode())
-            return True
-    return False
-
-
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield the name under which to write the file. At every moment `path` is what it was or the whole new file.
-
-    Raises:
-        ValueError: a place that cannot be written.
-        OSError: the disk refused; `path` is what it was.
-    """
+    """Yield the name under which to write the file. At every moment `path` is what it was or the whole new file. A
+    place that cannot be written is a ValueError; what the disk refuses an OSError, and `path` is what it was."""
     aside = path.resolve().with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
 
     def dropped() -> str:
@@ -153,14 +141,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def save_figure(figure: Any, path: Path, dpi: float | int) -> None:
-    """Write a figure of matplotlib, of the kind that the suffix says, PNG where there is none.
-
-    It is drawn in memory first: matplotlib's writers do not all report what the disk refuses.
-
-    Raises:
-        ValueError: a kind that matplotlib does not know; see `replacing`.
-        OSError: see `replacing`.
-    """
+    """Write a figure of matplotlib, of the kind that the suffix says, PNG where there is none (see `replacing`). It
+    is drawn in memory first: matplotlib's writers do not all report what the disk refuses."""
     drawn = io.BytesIO()
     figure.savefig(drawn, format=path.suffix[1:] or "png", dpi=dpi)
     with replacing(path) as aside:
@@ -174,17 +156,13 @@ def reason(error: BaseException) -> str:
     return match[1] if match else text.splitlines()[0].strip("'\"")
 
 
-class StagedFile:
+class StagedFile(io.RawIOBase):
     """A file object for h5py that stages all changes in memory, on top of an existing file. A context manager: leaving
     it drops what was not committed."""
 
     def __init__(self, path: Path):
-        """Open a file and lock it for writing. The lock goes with the process, however that ends; readers are free.
-
-        Raises:
-            BlockingIOError: another writer is at it.
-            OSError: it cannot be opened.
-        """
+        """Open a file and lock it for writing; a BlockingIOError if another writer is at it. The lock goes with the
+        process, however that ends; readers are free."""
         self._raw = open(path, "r+b", buffering=0)  # noqa: SIM115 (closed by `close`)
         try:
             _lock(self._raw.fileno(), shared=False)
@@ -203,16 +181,6 @@ class StagedFile:
         """Move to a position."""
         self._at = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._length}[whence] + offset
         return self._at
-
-    def tell(self) -> int:
-        """The position."""
-        return self._at
-
-    def read(self, size: int) -> bytes:
-        """Read a number of bytes; those beyond the end are zero."""
-        into = bytearray(size)
-        self.readinto(into)
-        return bytes(into)
 
     def readinto(self, into: Any) -> int:
         """Read into a buffer; bytes beyond the end are zero."""
@@ -235,16 +203,14 @@ class StagedFile:
         self._length = max(self._length, end) if len(view) else self._length
         return len(view)
 
-    def truncate(self, size: int) -> int:
+    def truncate(self, size: int | None = None) -> int:
         """Stage the file's length."""
+        size = self._at if size is None else size
         self._base, self._length = min(self._base, size), size
         self._pages = {number: page for number, page in self._pages.items() if number * _PAGE < size}
         if (last := self._pages.get(size // _PAGE)) is not None:
             last[size % _PAGE :] = bytes(_PAGE - size % _PAGE)
         return size
-
-    def flush(self) -> None:
-        """Do nothing: only `commit` writes."""
 
     def _page(self, number: int) -> bytearray:
         """A page to be changed."""
@@ -254,11 +220,8 @@ class StagedFile:
         return self._pages[number]
 
     def commit(self) -> None:
-        """Bring the file up to date.
-
-        Raises:
-            OSError: the disk refused; the file is what it was, and what was staged is lost.
-        """
+        """Bring the file up to date. If the disk refuses, an OSError: the file is what it was, and what was staged
+        is lost."""
         with undisturbed():
             for number in _pages_of(self._base, min(self._length, self._size)):
                 self._page(number)  # what was cut off and grew again is zero
@@ -287,26 +250,17 @@ class StagedFile:
             return False
 
     def sync(self) -> None:
-        """Wait until what was committed is on the disk.
-
-        Raises:
-            OSError: it cannot be brought there.
-        """
+        """Wait until what was committed is on the disk."""
         os.fsync(self._raw.fileno())
 
     def close(self) -> None:
-        """Close the file, without what was not committed."""
+        """Close the file, without what was not committed. For HDF5, which may still write as it is collected, for
+        nothing, it stays open."""
         self._raw.close()
-
-    def __enter__(self) -> "StagedFile":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _stored(self, at: int, size: int) -> bytes:
         """The bytes of the file on the disk at a position, as far as it has them."""
-        parts, left = [], 0 if self._raw.closed else size  # HDF5 may still write as it is collected, for nothing
+        parts, left = [], 0 if self._raw.closed else size
         if left > 0:
             self._raw.seek(at)
         while left > 0 and (part := self._raw.read(left)):
@@ -372,23 +326,16 @@ class ReplacedFile:
     it gives up the lock."""
 
     def __init__(self, path: Path, *, new: bool):
-        """Take the lock of a file that is there; with `new`, of one that the first `write` makes.
-
-        Raises:
-            ValueError: with `new`, a file that is there, or no folder; else one that cannot be written or is being
-                written.
-        """
+        """Take the lock of a file that is there; with `new`, of one that the first `write` makes. A ValueError says
+        why it cannot."""
         if new:
             require(not path.exists(), f"{path} exists: choose another name, remove it, or ask to resume it.")
             require(path.resolve().parent.is_dir(), f"{path} cannot be written (no folder {path.parent}).")
         self._path, self._lock = path, None if new else _locked(path)
 
     def write(self, data: bytes) -> None:
-        """Replace what the file holds.
-
-        Raises:
-            OSError: the disk refused, or another file has the name; that is what it was.
-        """
+        """Replace what the file holds. If the disk refuses, or another file has the name, an OSError: that is what
+        it was."""
         if self._lock is not None and self._path.exists() and not self._lock.is_at(self._path):
             raise OSError(f"{self._path} was replaced by another file while it was written: choose another name.")
         with undisturbed():

@@ -14,9 +14,9 @@ from mpmjax.simulation._run import (
     no_steps as no_steps,
 )
 from mpmjax.simulation._simulate import (
-    before_fault as before_fault,
-    integrate as integrate,
     number_of_steps as number_of_steps,
     rollout as rollout,
+    run_to as run_to,
+    segment as segment,
     simulate as simulate,
 )

@@ -16,7 +16,6 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Int, Scalar, components, particle_first
 from mpmjax.autodiff import rematerialised
 from mpmjax.boundary import Impulses, no_impulses
-from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
 from mpmjax.native import materialised
 from mpmjax.simulation._run import Fault, RunStatistics, no_steps, one_step
@@ -24,15 +23,14 @@ from mpmjax.simulation._sorting import MemoryOrder, resorted
 from mpmjax.state import Particles, Scene, State, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator, StepInfo, step_compiled
 
-LEAST_STRETCH = 1e-2
-"""Principal stretch [-] below which a particle has collapsed."""
+LEAST_STRETCH = 1e-2  # principal stretch [-] below which a particle has collapsed
 
 
 class RolloutState(eqx.Module):
     """The part of a rollout that evolves: the particles' state, and what colliders and boundaries have received."""
 
     particles: State
-    collider_impulse: Impulses | None
+    collider_impulse: Impulses | None = None
     """Linear and angular impulse on the scene's colliders since the rollout began; None without colliders."""
     boundary_impulse: Impulses | None = None
     """Linear and angular impulse on the scene's boundaries; None unless the scene has `boundary_forces`."""
@@ -87,16 +85,12 @@ class Problem(eqx.Module):
     dt: Scalar
     method: AbstractIntegrator
     observe: Callable[[Scene, Particles], Any] | None = None
-    start: Scalar = 0.0
-    """Number of the first step."""
-    until: Scalar = np.inf
-    """Number of steps after which a watched run ends, if it is less than were asked for."""
-    slot: Scalar = 0.0
-    """Zero; adjoint solves report through its cotangent (see `Reporting`)."""
+    start: Scalar = 0.0  # number of the first step
+    until: Scalar = np.inf  # number of steps after which a watched run ends, if it is less than were asked for
+    slot: Scalar = 0.0  # zero; adjoint solves report through its cotangent (see `Reporting`)
     fault: Int[Array, ""] | None = None
     """`Fault` of the state before the first step; None if it is known that there is none."""
-    unmet: Int[Array, ""] | None = None
-    """See `RunStatistics`; likewise."""
+    unmet: Int[Array, ""] | None = None  # see `RunStatistics`; likewise
     save_every: int | None = eqx.field(static=True, default=None)
     """Number of steps between saved frames, if there are any."""
 
@@ -105,13 +99,8 @@ class Problem(eqx.Module):
         return with_state(self.particles, state)
 
     def resorted(self, y: RolloutState, step: Array) -> "tuple[Problem, RolloutState]":
-        """The problem and the state before a step, their particles in the order of the state, which are sorted if it is
-        time to.
-
-        Args:
-            y: the state as the loop has it.
-            step: the number of steps since the rollout began.
-        """
+        """The problem and the state y before a step, `step` of them since the rollout began, their particles in the
+        order of the state, which are sorted if it is time to."""
         y = y.from_loop_layout(materialised)
         if y.order is None:
             return self, y
@@ -151,7 +140,7 @@ def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -
     return [(number, passed) for number, passed in enumerate(passed_by) if passed is not None]
 
 
-def _gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
+def gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
     """The gravest fault that any particle has, of faults in their order, by one reduction over the particles."""
     rank, worst = jnp.zeros_like(next(iter(faults.values())), jnp.int32), jnp.asarray(Fault.NONE, jnp.int32)
     for place, particles in enumerate(reversed(faults.values()), 1):
@@ -164,32 +153,6 @@ def _gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
 
 _GRAVEST_FIRST = (Fault.NOT_FINITE, Fault.PASSED, Fault.OUTSIDE, Fault.INADMISSIBLE, Fault.COLLAPSED)
 """The faults of a state, and of the step that led to it."""
-
-
-def _fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
-    """The gravest fault of a state, or of the step from t [s] that led to it."""
-    faults = faulty_particles(problem, after, t + problem.dt)
-    passed = [particles for _, particles in passed_particles(problem, before, after, t)]
-    if passed:
-        faults[Fault.PASSED] = reduce(jnp.logical_or, passed)
-    return _gravest({fault: faults[fault] for fault in _GRAVEST_FIRST if fault in faults})
-
-
-def examined(problem: Problem, state: RolloutState) -> tuple[Problem, RolloutState]:
-    """The problem with the fault of its start, found from values that were not known when they were given, and the
-    state, made NaN if a parameter is bad, since what follows would look like numbers."""
-    arrays, rest = eqx.partition((problem, state), eqx.is_array)
-    constant, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
-    unmet = first_unmet(requirements((constant.scene, constant.particles, constant.method)))
-    fault = _gravest(faulty_particles(constant, begin.particles, constant.start * constant.dt))
-    valid = jnp.where(unmet > 0, jnp.nan, 1)
-    state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
-    return replace(problem, fault=jnp.where(unmet > 0, Fault.BAD_PARAMETERS, fault), unmet=unmet), state
-
-
-def step_number(t: Array) -> Array:
-    """diffrax's time as the number of a step: it divides an interval evenly, which is exact only up to rounding."""
-    return jnp.round(t)
 
 
 class StepSolver(diffrax.AbstractSolver):
@@ -221,20 +184,25 @@ class StepSolver(diffrax.AbstractSolver):
         """One step. A fault is reported as the solver's failure: as an event diffrax would ask for it once more."""
         del terms, t1, made_jump
         statistics, report = solver_state
-        args, y = args.resorted(y0, step_number(t0))
-        t = (args.start + step_number(t0)) * args.dt
+        step = jnp.round(t0)  # diffrax divides an interval evenly, which is exact only up to rounding
+        args, y = args.resorted(y0, step)
+        t = (args.start + step) * args.dt
         method = args.method.reporting(args.slot)
         particles, info = step_compiled(args.scene, args.at(y.particles), t, args.dt, method, args.stencil)
         report = report + info.solve.report
         y1 = y.after(particles, info)
         arrays, rest = eqx.partition((args, y.particles, y1.particles, t), eqx.is_array)
-        fault = _fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
+        constant, before, after, t = eqx.combine(jax.lax.stop_gradient(arrays), rest)
+        faults = faulty_particles(constant, after, t + constant.dt)
+        if passed := [particles for _, particles in passed_particles(constant, before, after, t)]:
+            faults[Fault.PASSED] = reduce(jnp.logical_or, passed)
+        fault = gravest({fault: faults[fault] for fault in _GRAVEST_FIRST if fault in faults})
         statistics = statistics.merged(one_step(info, fault), solved=not args.method.is_explicit)
         y1 = y1.to_loop_layout()
         results: Any = diffrax.RESULTS  # whose members the type checker takes for another type
         result = results.successful
         if self.watch:
-            goes_on = (statistics.fault == Fault.NONE) & (step_number(t0) + 1 < args.until)
+            goes_on = (statistics.fault == Fault.NONE) & (step + 1 < args.until)
             result = results.where(goes_on, result, results.nonlinear_divergence)
         return y1, None, {"y0": y0, "y1": y1}, (statistics, report), result
 
@@ -243,14 +211,7 @@ class StepSolver(diffrax.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def no_vector_field(t: Any, y: RolloutState, args: Problem) -> RolloutState:
-    """A stand-in for the equation that diffrax expects; the solver does not evaluate it."""
-    del t, args
-    return jax.tree.map(jnp.zeros_like, y)
-
-
-_MOST_LOOPS = 4
-"""Each further loop takes all steps once more."""
+_MOST_LOOPS = 4  # each further loop takes all steps once more
 
 
 class SegmentAdjoint(diffrax.AbstractAdjoint):
@@ -269,7 +230,7 @@ class SegmentAdjoint(diffrax.AbstractAdjoint):
         return self._loop(inner_while_loop=None, outer_while_loop=self._nested_loops, **of_diffrax)
 
     def _nested_loops(self, cond_fun: Any, body_fun: Any, state: Any, *, max_steps: int, buffers: Any) -> Any:
-        """The state after all steps, with the arguments of `equinox.internal.while_loop`."""
+        """As `equinox.internal.while_loop`."""
         del cond_fun, buffers
         turns = math.prod(self.lengths)
 
@@ -291,16 +252,10 @@ class SegmentAdjoint(diffrax.AbstractAdjoint):
 def checkpointed(
     steps: int, state_bytes: int, step_bytes: int, budget: int, *, stops: bool = False
 ) -> diffrax.AbstractAdjoint:
-    """The adjoint for reverse mode that computes steps again as seldom as a budget allows: by segments, in up to four
-    loops; with less memory diffrax's, whose checkpoints move.
-
-    Args:
-        steps: number of steps.
-        state_bytes: memory of a state [B].
-        step_bytes: memory of what is stored of a step at once, with the state that it starts from [B].
-        budget: memory for all of them [B].
-        stops: whether a fault may stop the run, which ends diffrax's loop alone.
-    """
+    """The adjoint for reverse mode that computes steps again as seldom as a `budget` of memory allows [B]: by
+    segments, in up to four loops; with less memory, or where a fault `stops` the run, diffrax's, whose checkpoints
+    move. A state takes `state_bytes`, what is stored of a step at once `step_bytes`, with the state that it starts
+    from."""
     for loops in () if stops else range(1, _MOST_LOOPS + 1):
         *outer, inner = _lengths(steps, loops)
         if sum(outer) * state_bytes + inner * step_bytes <= budget:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -28,8 +28,8 @@ def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState],
         previous = before()
         step = start + int(run.statistics.fault_step)
         problem = Problem(run.scene, run.final, None, run.dt, run.method)
-        words, bad = _WORDS[fault], faulty_particles(problem, state_of(run.final), step * run.dt)
-        what, advice = words.particle, words.advice
+        bad = faulty_particles(problem, state_of(run.final), step * run.dt)
+        _, what, advice = _WORDS[fault]
         if fault == Fault.PASSED:
             t = jnp.asarray(step - 1, run.final.x.dtype) * run.dt
             passed = passed_particles(problem, previous.particles, state_of(run.final), t)
@@ -104,43 +104,33 @@ def warn_of_inaccuracy(run: Run) -> None:
         )
 
 
-class _Words(NamedTuple):
-    """The parts of a fault's message."""
-
-    state: str
-    """Subject, where no particle can be named."""
-    particle: str = ""
-    """Predicate of a particle, after its number; empty where it depends on the law (`disallowed`)."""
-    advice: str = ""
-    """The remedy; empty likewise."""
-
-
-_WORDS: dict[Fault, _Words] = {
-    Fault.NOT_FINITE: _Words(
+_WORDS: dict[Fault, tuple[str, str, str]] = {
+    Fault.NOT_FINITE: (
         "a state that is not finite",
         "is no longer finite",
         "Look in the frames before (save_every) for what grows out of scale: a force, a prescribed motion, a velocity.",
     ),
-    Fault.OUTSIDE: _Words(
+    Fault.OUTSIDE: (
         "a particle outside the grid's window",
         "left the grid's window",
         "Enlarge the grid's shape, or use follow=True.",
     ),
-    Fault.INADMISSIBLE: _Words("a deformation gradient that its law does not allow"),
-    Fault.COLLAPSED: _Words(
+    Fault.INADMISSIBLE: ("a deformation gradient that its law does not allow", "", ""),
+    Fault.COLLAPSED: (
         "a particle that has collapsed",
         f"has collapsed: a stretch of it is below {LEAST_STRETCH:g}, where the force of its law may vanish",
         "Take a law whose energy has no bound there, such as NeoHookean, or in the total description any; or a lower "
         "velocity.",
     ),
-    Fault.PASSED: _Words(
+    Fault.PASSED: (
         "a particle that passed a boundary",
         "passed",
         "Reduce dt: a boundary keeps out what comes less than a cell nearer in a step.",
     ),
 }
-LARGEST_LINEARISATION_ERROR = 0.05
-"""Linearisation error [-] of a run beyond which it is warned of."""
+"""The parts of a fault's message: subject, where no particle can be named; predicate of a particle, after its number,
+and remedy, both empty where they depend on the law (`disallowed`)."""
+LARGEST_LINEARISATION_ERROR = 0.05  # linearisation error [-] of a run beyond which it is warned of
 _ADVICE = (
     "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
     "inspect run.statistics."
@@ -158,7 +148,7 @@ def guarded(run: Run, report: Array) -> Run:
     jax.eval_shape(lambda a: names.extend(r.message for r in requirements(eqx.combine(a, rest))), inputs)
     statistics = run.statistics
     unsolved = (statistics.fault == Fault.NONE) & (statistics.unconverged > 0)
-    states = [(words.state, statistics.fault == fault) for fault, words in _WORDS.items()]
+    states = [(state, statistics.fault == fault) for fault, (state, *_) in _WORDS.items()]
     states.append(("a solve that did not converge", unsolved))
     met = jnp.stack([holds for _, holds in states])
     number = jnp.where(met.any(), 1 + jnp.argmax(met).astype(jnp.int32), 0)

@@ -89,16 +89,11 @@ class RunStatistics(eqx.Module):
         for name in (field.name for field in fields(self)):
             a, b = getattr(self, name), getattr(later, name)
             both[name] = a + b if name not in _LARGEST else jnp.maximum(a, b) if solved else a
-        return RunStatistics(
-            **both
-            | {
-                "fault": jnp.where(first, later.fault, self.fault),
-                "fault_step": jnp.where(
-                    first & (later.fault != Fault.NONE), self.steps + later.fault_step, self.fault_step
-                ),
-                "unmet": jnp.where(first, later.unmet, self.unmet),
-            }
-        )
+        meets = first & (later.fault != Fault.NONE)
+        both["fault"] = jnp.where(first, later.fault, self.fault)
+        both["fault_step"] = jnp.where(meets, self.steps + later.fault_step, self.fault_step)
+        both["unmet"] = jnp.where(first, later.unmet, self.unmet)
+        return RunStatistics(**both)
 
 
 _LARGEST = ("most_iterations", "worst_residual", "force_error", "force_scale")

@@ -17,6 +17,7 @@ from mpmjax.autodiff import guard, rematerialised
 from mpmjax.checks import (
     canonical,
     checked,
+    first_unmet,
     is_traced,
     require,
     require_finite,
@@ -30,13 +31,12 @@ from mpmjax.simulation._diffrax import (
     RolloutState,
     StepSolver,
     checkpointed,
-    examined,
+    faulty_particles,
+    gravest,
     initial_state,
-    no_vector_field,
-    step_number,
 )
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
-from mpmjax.simulation._run import Run, RunStatistics
+from mpmjax.simulation._run import Fault, Run, RunStatistics
 from mpmjax.simulation._sorting import memory_order
 from mpmjax.state import Particles, Scene, prepare, state_of, warn_of_rounding, with_state
 from mpmjax.stepping import MOST_STEPS, AbstractIntegrator, Explicit, step_for, step_unchecked
@@ -152,28 +152,27 @@ def simulate(
     )
     end = go()
     values, on_colliders, on_boundaries = end.saved
-    run = Run(
-        scene=scene,
-        method=method,
-        dt=dt_,
+    run = run_to(
+        end.state,
+        end.step,
+        end.statistics,
+        scene,
+        particles,
+        dt_,
+        method,
         steps=end.steps,
         frames=values if observe is None else None,
         observed=None if observe is None else values,
-        final=with_state(particles, end.state.particles),
-        final_step=end.step,
-        statistics=end.statistics,
         report=end.report if traced else None,
         collider_impulse=on_colliders,
-        final_collider_impulse=end.state.collider_impulse,
         boundary_impulse=on_boundaries,
-        final_boundary_impulse=end.state.boundary_impulse,
     )
     if not throw:
         return run
     if traced:
         return guarded(run, end.report)
     warn_of_rounding(scene.grid, run.final.x, particles.x)
-    raise_faults(run, particles, lambda: before_fault(go, begin, end.statistics), start)
+    raise_faults(run, particles, lambda: _before_fault(go, begin, end.statistics), start)
     warn_of_inaccuracy(run)
     return run
 
@@ -192,12 +191,9 @@ def rollout(
     mode stores the state before each step and the solutions of implicit solves, and computes the rest again.
 
     Args:
-        scene: the scene.
-        particles: the particles at step `start`.
+        scene, particles, method, start: as in `simulate`.
         steps: number of steps.
         dt: step [s].
-        method: update of the grid velocity.
-        start: number of the first step.
 
     Raises:
         ValueError: from `prepare`; a step that is not positive, or a number of steps that is negative.
@@ -227,11 +223,8 @@ def _rollout(
 
 
 def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
-    """How many steps of dt lead from step `start` to time t1.
-
-    Raises:
-        ValueError: not a whole number, none, or more than the precision can count.
-    """
+    """How many steps of dt lead from step `start` to time t1; a ValueError if that is no whole number, none, or more
+    than the precision can count."""
     if is_traced((t1, dt)):
         raise ValueError("t1 and dt fix the number of steps and must be known numbers, not traced ones.")
     require_positive("dt [s]", dt, dtype)
@@ -258,17 +251,14 @@ def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
 class End(NamedTuple):
     """The end of an integration."""
 
-    steps: Float[Array, "f"]
-    """Numbers of the saved frames; none if nothing was saved."""
+    steps: Float[Array, "f"]  # numbers of the saved frames; none if nothing was saved
     saved: Any
     """The frames, along a first axis: of each its state or what was observed, and the impulses on colliders and on
     boundaries."""
     state: RolloutState
-    step: Float[Array, ""]
-    """The number of the last step."""
+    step: Float[Array, ""]  # the number of the last step
     statistics: RunStatistics
-    report: Float[Array, ""]
-    """Relative residual of the first tangent solve that did not converge; zero if all did."""
+    report: Float[Array, ""]  # relative residual of the first tangent solve that did not converge; zero if all did
 
 
 @eqx.filter_jit
@@ -284,11 +274,11 @@ def integrate(
     *,
     until: Scalar | Float[np.ndarray, ""],
     max_steps: int,
-    save_every: int | None,
-    observe: Callable[[Scene, Particles], Any] | None,
-    adjoint: diffrax.AbstractAdjoint,
-    progress: bool,
-    watch: bool,
+    save_every: int | None = None,
+    observe: Callable[[Scene, Particles], Any] | None = None,
+    adjoint: diffrax.AbstractAdjoint = diffrax.ForwardMode(),  # the plain loop
+    progress: bool = False,
+    watch: bool = True,
 ) -> End:
     """Integrate `count` ≤ `max_steps` steps from step `start`, at which the particles have this state.
 
@@ -302,8 +292,14 @@ def integrate(
     zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
     until, slot = (jnp.asarray(a, start.dtype) for a in (until, slot))
     problem = Problem(scene, particles, stencil, dt, method, observe, start, until, slot, save_every=save_every)
-    if not watch:
-        problem, state = examined(problem, state)
+    if not watch:  # the fault of the start, from values that were not known when they were given
+        arrays, rest = eqx.partition((problem, state), eqx.is_array)
+        constant, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
+        unmet = first_unmet(requirements((constant.scene, constant.particles, constant.method)))
+        fault = gravest(faulty_particles(constant, begin.particles, constant.start * constant.dt))
+        valid = jnp.where(unmet > 0, jnp.nan, 1)  # with a bad parameter what follows would look like numbers
+        state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
+        problem = replace(problem, fault=jnp.where(unmet > 0, Fault.BAD_PARAMETERS, fault), unmet=unmet)
     state = replace(state, order=memory_order(scene, particles, save_every or max_steps)).to_loop_layout()
 
     def frame(t: Any, y: RolloutState, args: Problem) -> Any:
@@ -316,7 +312,7 @@ def integrate(
     if save_every is not None:
         subs["frames"] = diffrax.SubSaveAt(t0=True, t1=True, steps=save_every, fn=frame)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(no_vector_field),
+        diffrax.ODETerm(lambda t, y, args: y),  # the solver does not evaluate it
         StepSolver(watch),
         t0=zero,
         t1=all_steps if count is None else count,
@@ -333,12 +329,58 @@ def integrate(
     final = jax.tree.map(lambda a: a[-1], values["final"])
     steps, saved = jnp.zeros((0,), start.dtype), (None, None, None)
     if save_every is not None:
-        steps, saved = start + step_number(times["frames"]), values["frames"]
+        steps, saved = start + jnp.round(times["frames"]), values["frames"]
     return End(steps, saved, final, start + statistics.steps.astype(start.dtype), statistics, report)
 
 
-def before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
+def _before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
     """The last good state of a run that met a fault, computed once more by the same program, `integrate` with all its
     arguments but `until`: no run carries it."""
     good = int(statistics.fault_step) - 1
     return begin if good == 0 else go(until=np.asarray(good, begin.particles.x.dtype)).state
+
+
+def segment(
+    scene: Scene,
+    particles: Particles,
+    begin: RolloutState,
+    step: int,
+    count: int,
+    dt: Scalar,
+    method: AbstractIntegrator,
+    *,
+    max_steps: int,
+) -> tuple[RolloutState, RunStatistics, Callable[[], RolloutState]]:
+    """The state after `count` ≤ `max_steps` steps from step `step`, their statistics, and a function that returns the
+    last good state. The arguments are canonical. Segments of all lengths are one compiled program."""
+    dtype = particles.x.dtype
+    first, number, until = jnp.asarray(step, dtype), jnp.asarray(count, dtype), np.asarray(np.inf, dtype)
+    go = partial(integrate, scene, particles, begin, first, number, dt, method, until=until, max_steps=max_steps)
+    end = go()
+    return end.state, end.statistics, partial(_before_fault, go, begin, end.statistics)
+
+
+def run_to(
+    state: RolloutState,
+    step: Any,
+    statistics: RunStatistics,
+    scene: Scene,
+    particles: Particles,
+    dt: Scalar,
+    method: AbstractIntegrator,
+    **saved: Any,
+) -> Run:
+    """The run that ended in this state at step `step`; `saved` are its fields that hold more than its end."""
+    dtype = particles.x.dtype
+    saved = {"steps": jnp.zeros((0,), dtype), "frames": None, "observed": None} | saved
+    return Run(
+        scene=scene,
+        method=method,
+        dt=dt,
+        final=with_state(particles, state.particles),
+        final_step=jnp.asarray(step, dtype),
+        statistics=statistics,
+        final_collider_impulse=state.collider_impulse,
+        final_boundary_impulse=state.boundary_impulse,
+        **saved,
+    )

@@ -6,7 +6,6 @@ returned, saved or observed has the order in which the particles were given.
 
 import os
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -21,15 +20,11 @@ from mpmjax.discretisation import BSpline, Grid, basis_of, first_nodes
 from mpmjax.native import NativeFunction, is_native
 from mpmjax.state import AttachedPoints, Particles, Scene, State, by_material, is_foreign
 
-Order = Int[Array, "p"]
-"""The number of the particle that comes first, second, ..."""
+Order = Int[Array, "p"]  # the number of the particle that comes first, second, ..
 VARIABLE = "MPMJAX_ORDER"
-LEAST = 16_384
-"""Fewer particles stay as they were given: they fit into the cache in any order."""
-STEPS = 50
-"""Steps between two sorts."""
-FEWEST = 10
-"""In runs of fewer steps, in all or between two frames, particles stay as they were given."""
+LEAST = 16_384  # fewer particles stay as they were given: they fit into the cache in any order
+STEPS = 50  # steps between two sorts
+FEWEST = 10  # in runs of fewer steps, in all or between two frames, particles stay as they were given
 MIXED = 0.25
 """Particles are sorted if more than this share of them are in another cell than the one before and the next one."""
 
@@ -80,14 +75,13 @@ def memory_order(scene: Scene, particles: Particles, steps: int) -> MemoryOrder 
     if asked or not mixes or not countable or scene.body_force is not None or steps < FEWEST or not is_native():
         return None
 
-    def one_a_particle(size: int, node: Any) -> bool:
-        return eqx.is_array(node) and node.shape == (size,)
-
-    laws = zip(scene.laws, particles.sizes, strict=True)
-    chosen = [(law, jax.tree.map(partial(one_a_particle, n), law, is_leaf=is_foreign)) for law, n in laws]
+    parameters = []
+    for law, n in zip(scene.laws, particles.sizes, strict=True):
+        chosen = jax.tree.map(lambda a, n=n: eqx.is_array(a) and a.shape == (n,), law, is_leaf=is_foreign)
+        parameters.append(eqx.filter(law, chosen))
     number = jnp.arange(particles.count, dtype=particles.x.dtype)
     numbers = jnp.stack([number, particles.mass, particles.volume])
-    return MemoryOrder(numbers, tuple(eqx.filter(law, which) for law, which in chosen), _attached(scene))
+    return MemoryOrder(numbers, tuple(parameters), _attached(scene))
 
 
 def resorted(
@@ -108,8 +102,13 @@ def resorted(
         place = _places(order.number)
         original = replace(particles, x=jax.lax.stop_gradient(state.x)[place])
         cells = cells_of(scene.kernel, scene.grid, scene.window(original), scene.on_grid(original, t))
-        parts = [(group.rows[0], cells[slice(*group.rows)]) for group in particles.groups]
-        number = jnp.concatenate([first + _sorted_if_mixed(part) for first, part in parts])
+        numbers = []
+        for group in particles.groups:  # by cell if many are far from their neighbours
+            part = cells[slice(*group.rows)]
+            mixed = (jnp.abs(part[1:] - part[:-1]) > 1).mean() > MIXED
+            by_number = jnp.arange(part.size, dtype=part.dtype)
+            numbers.append(group.rows[0] + jnp.where(mixed, by_cell(part), by_number))
+        number = jnp.concatenate(numbers)
         new = _places(number)
         return place[number], tuple(new[_whole(rows)].astype(rows.dtype) for rows in _attached(scene))
 
@@ -153,12 +152,6 @@ def _places(order: Order) -> Order:
     return jnp.zeros_like(order).at[order].set(jnp.arange(order.size, dtype=order.dtype), unique_indices=True)
 
 
-def _sorted_if_mixed(cells: Int[Array, "q"]) -> Order:
-    """The numbers of one material's particles, by cell if many are far from their neighbours."""
-    mixed = (jnp.abs(cells[1:] - cells[:-1]) > 1).mean() > MIXED
-    return jnp.where(mixed, by_cell(cells), jnp.arange(cells.size, dtype=cells.dtype))
-
-
 def cells_of(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Int[Array, "p"]:
     """The C-order index of the first node of each particle's stencil, shape (p,): particles with the same one share all
     nodes. Without meaning outside of the window."""
@@ -180,10 +173,6 @@ def rearranged(wanted: Bool[Array, ""], order: Order, a: Float[Array, "p ..."]) 
     rows = components(a).reshape(-1, len(a))
     moved = _native_rearrange(wanted, order, rows, inverse=False)[0]
     return particle_first(moved.reshape(*a.shape[1:], len(a)))
-
-
-def _sort(cells: Array) -> list[Array]:
-    return [jnp.argsort(cells, stable=True).astype(cells.dtype)]
 
 
 def _rearrange(wanted: Array, order: Array, rows: Array, *, inverse: bool) -> list[Array]:
@@ -208,7 +197,10 @@ def _transpose(cotangents: list, wanted: Any, order: Any, rows: Any, *, batched:
 
 
 _native_sort = NativeFunction(
-    "order", _sort, lambda cells: [cells.shape[-1:]], lambda cells, batched: cells.dtype == np.int32
+    "order",
+    lambda cells: [jnp.argsort(cells, stable=True).astype(cells.dtype)],
+    lambda cells: [cells.shape[-1:]],
+    lambda cells, batched: cells.dtype == np.int32,
 )
 _native_rearrange = NativeFunction(
     "rearrange",

@@ -7,11 +7,6 @@ from mpmjax.state._attachment import (
     Patch as Patch,
     PointsAt as PointsAt,
 )
-from mpmjax.state._averaged_volume import (
-    AveragedStiffness as AveragedStiffness,
-    AveragedVolume as AveragedVolume,
-    VolumeAverage as VolumeAverage,
-)
 from mpmjax.state._fill import fill as fill, fill_mapped as fill_mapped
 from mpmjax.state._loads import (
     AbstractBodyForce as AbstractBodyForce,
@@ -25,7 +20,12 @@ from mpmjax.state._loads import (
     points_of as points_of,
     terms_of as terms_of,
 )
-from mpmjax.state._material_points import MaterialPoints as MaterialPoints
+from mpmjax.state._material_points import (
+    AveragedStiffness as AveragedStiffness,
+    AveragedVolume as AveragedVolume,
+    MaterialPoints as MaterialPoints,
+    VolumeAverage as VolumeAverage,
+)
 from mpmjax.state._particles import (
     Particles as Particles,
     State as State,

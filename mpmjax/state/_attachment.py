@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
-from mpmjax import linalg as la
-from mpmjax._types import Array, Float, Int, Matrix, NodeVector, ParticleMatrix, Scalar, components
+from mpmjax._types import Array, Float, Int, Matrix, NodeVector, Scalar
 from mpmjax.checks import is_traced, require, require_fields, require_positive, require_that, warn
 from mpmjax.discretisation import Stencil, gather, scatter
-from mpmjax.geometry import AbstractRegion, Pieces, surface_pieces
+from mpmjax.geometry import AbstractRegion, surface_pieces
 from mpmjax.material import AbstractLaw
 from mpmjax.potential import Displacement
 from mpmjax.state._particles import Particles
@@ -20,12 +19,9 @@ from mpmjax.state._particles import Particles
 Rows = Float[Array, "s d"] | Float[np.ndarray, "s d"] | tuple | list
 Numbers = Float[Array, "s"] | Float[np.ndarray, "s"] | tuple[float | int | Array, ...] | list[float | int]
 
-_NARROW = 1.999
-"""A patch narrower than so many particle spacings is not resolved."""
-_FAR = 2.0
-"""How many particle spacings a point may lie off the nearest particle."""
-_ROUNDED = 1e-4
-"""How far the sum of shares may be from one, for rounding's sake."""
+_NARROW = 1.999  # a patch narrower than so many particle spacings is not resolved
+_FAR = 2.0  # how many particle spacings a point may lie off the nearest particle
+_ROUNDED = 1e-4  # how far the sum of shares may be from one, for rounding's sake
 
 
 class AbstractPlace(eqx.Module):
@@ -38,11 +34,7 @@ class AbstractPlace(eqx.Module):
 
     @abc.abstractmethod
     def attached(self, particles: Particles) -> "AttachedPoints":
-        """The points of it, attached to the particles.
-
-        Raises:
-            ValueError: there are none, or one of them lies off the body.
-        """
+        """The points of it, attached to the particles; a ValueError if there are none, or one lies off the body."""
 
 
 class AttachedPoints(AbstractPlace):
@@ -124,7 +116,19 @@ class Patch(AbstractPlace):
             f"The {self} has no surface at the particles, or only on the boundary of `within`: move or enlarge it.",
         )
         if self.within is not None:
-            self._warn(pieces, surface.size.sum(), apart)
+            kept, whole = pieces.size.sum(), surface.size.sum()
+            wide = np.ptp(pieces.corners.reshape(-1, self.dim), axis=0)
+            if (wide >= _NARROW * apart).sum() < self.dim - 1:
+                warn(
+                    f"The Patch is {' x '.join(f'{a:.3g}' for a in wide)} m wide, less than two particles, "
+                    f"{apart:.3g} m apart: its force and moment are right, but the grid spreads them further. Refine "
+                    "the grid, or enlarge the patch."
+                )
+            if whole > 2 * kept:
+                warn(
+                    f"Of the surface in a Patch's `within`, {whole - kept:.3g} m^{self.dim - 1} lie on its boundary "
+                    f"and do not count, {kept:.3g} lie inside: enlarge `within` beyond what is meant."
+                )
         middle, area = pieces.middle, pieces.area
         weight = np.sqrt((area**2).sum(axis=1))
         particle = _nearest(x, middle, apart, self)
@@ -142,21 +146,6 @@ class Patch(AbstractPlace):
         first = np.zeros(len(whole), int)
         first[piece.reshape(-1)] = particle
         return _attached(particles, first, middle, whole, summed(area))
-
-    def _warn(self, pieces: Pieces, all_with_edges: float, apart: float) -> None:
-        """Warn of a patch narrower than two particles, and of one of which most lies on the boundary of `within`."""
-        kept, wide = pieces.size.sum(), np.ptp(pieces.corners.reshape(-1, self.dim), axis=0)
-        if (wide >= _NARROW * apart).sum() < self.dim - 1:
-            warn(
-                f"The Patch is {' x '.join(f'{a:.3g}' for a in wide)} m wide, less than two particles, {apart:.3g} m "
-                "apart: its force and moment are right, but the grid spreads them further. Refine the grid, or enlarge "
-                "the patch."
-            )
-        if all_with_edges > 2 * kept:
-            warn(
-                f"Of the surface in a Patch's `within`, {all_with_edges - kept:.3g} m^{self.dim - 1} lie on its "
-                f"boundary and do not count, {kept:.3g} lie inside: enlarge `within` beyond what is meant."
-            )
 
 
 class PointsAt(AbstractPlace):
@@ -245,26 +234,16 @@ class LoadedPoints(eqx.Module):
     """s points that move with particles: u_s = Σ_i N_is u_i with N_is = w_ip + g_ip·r_s, the particle's own motion at
     the arm r_s. So a force reaches no node that its particle does not reach, its sum is right and so is its moment."""
 
-    x: Float[Array, "d s"]
-    """Where they are [m]."""
-    v: Float[Array, "d s"]
-    """Their velocity, v_p + C_p r_s, without a C v_p [m/s]."""
-    deformation: Matrix | None
-    """F of their particles [-], shape (d, d, s); None where a law does not keep it."""
-    rate: Matrix | None
-    """Rate of F [1/s], shape (d, d, s); None without a velocity gradient."""
-    place: Float[Array, "d s"]
-    """Where they were when they were attached [m]."""
-    weight: Float[Array, "s"]
-    """Their undeformed areas [m^(d−1)], or shares [-]."""
-    area: Float[Array, "d s"] | None
-    """Outward normal times area of the undeformed surface [m^(d−1)]; None of points."""
-    arm: Float[Array, "d s"]
-    """r_s [m]: F_p R_s, in the total description R_s."""
-    stencil: Stencil
-    """Nodes, weights and derivatives of the particle that each point is attached to."""
-    particle: Int[Array, "s"]
-    """The number of that particle, shape (s,)."""
+    x: Float[Array, "d s"]  # where they are [m]
+    v: Float[Array, "d s"]  # their velocity, v_p + C_p r_s, without a C v_p [m/s]
+    deformation: Matrix | None  # F of their particles [-], shape (d, d, s); None where a law does not keep it
+    rate: Matrix | None  # rate of F [1/s], shape (d, d, s); None without a velocity gradient
+    place: Float[Array, "d s"]  # where they were when they were attached [m]
+    weight: Float[Array, "s"]  # their undeformed areas [m^(d−1)], or shares [-]
+    area: Float[Array, "d s"] | None  # outward normal times area of the undeformed surface [m^(d−1)]; None of points
+    arm: Float[Array, "d s"]  # r_s [m]: F_p R_s, in the total description R_s
+    stencil: Stencil  # nodes, weights and derivatives of the particle that each point is attached to
+    particle: Int[Array, "s"]  # the number of that particle, shape (s,)
 
     def after(self, time: Scalar) -> "LoadedPoints":
         """The points moved on by a time [s] with their velocity, and turned with its gradient."""
@@ -300,47 +279,6 @@ class LoadedPoints(eqx.Module):
         return jnp.zeros_like(mass).at[self.particle].add(rates * reach) / mass
 
 
-def loaded_points(
-    on: AttachedPoints, laws: tuple[AbstractLaw, ...], particles: Particles, stencil: Stencil, *, total: bool
-) -> LoadedPoints:
-    """The points of prepared particles at the start of a step."""
-    dtype = particles.x.dtype
-    rows = jnp.asarray(on.particle, dtype).astype(jnp.int32)
-    offset = jnp.asarray(on.offset, dtype).T
-    F = _deformation(laws, particles)
-    F = None if F is None else components(F[rows])
-    arm = offset if F is None else la.matmul(F, offset[:, None])[:, 0]
-    r = offset if total else arm
-    v, rate = components(particles.v[rows]), None
-    if particles.C is not None:
-        C = components(particles.C[rows])
-        v = v + la.matmul(C, r[:, None])[:, 0]
-        rate = None if F is None else C if total else la.matmul(C, F)
-    return LoadedPoints(
-        x=components(particles.x[rows]) + arm,
-        v=v,
-        deformation=F,
-        rate=rate,
-        place=jnp.asarray(on.place, dtype).T,
-        weight=jnp.asarray(on.weight, dtype),
-        area=None if on.area is None else jnp.asarray(on.area, dtype).T,
-        arm=r,
-        stencil=stencil.of(rows),
-        particle=rows,
-    )
-
-
 def keeps_deformation(law: AbstractLaw) -> bool:
     """Whether particles of a law keep the whole deformation gradient."""
     return law.allows_total and law.measure.undeformed(2).ndim == 2
-
-
-def _deformation(laws: tuple[AbstractLaw, ...], particles: Particles) -> ParticleMatrix | None:
-    """F of all particles, shape (p, d, d), the identity of those whose law does not keep it; None if none does."""
-    if not any(keeps_deformation(law) for law in laws):
-        return None
-    still, parts = jnp.eye(particles.dim, dtype=particles.x.dtype), []
-    for law, stored, count in zip(laws, particles.deformations, particles.sizes, strict=True):
-        whole = keeps_deformation(law) and stored is not None
-        parts.append(jnp.asarray(stored) if whole else jnp.broadcast_to(still, (count, *still.shape)))
-    return jnp.concatenate(parts)

@@ -17,10 +17,8 @@ from mpmjax.state._particles import Particles
 
 Velocity = Point | AbstractMotion | Callable[[Float[Array, "d"]], Float[Array, "d"]]
 
-_ALIKE = 1e-6
-"""Part of a cell by which a region may reach into the next for rounding's sake."""
-_SMALL = 0.02
-"""The least share of a cell that is a particle of its own."""
+_ALIKE = 1e-6  # part of a cell by which a region may reach into the next for rounding's sake
+_SMALL = 0.02  # the least share of a cell that is a particle of its own
 
 
 @checked
@@ -202,14 +200,8 @@ def _cut_cells(region: AbstractRegion, size: np.ndarray) -> tuple[np.ndarray, np
     number = np.maximum(last - first, 1).astype(int)
     centres, volume = box_cells(first * size, (first + number) * size, size)
     share, centroid = inside_parts(region, centres, size)
-    share, centroid = _merged(share.reshape(number), centroid.reshape(*number, -1))
-    kept = share > 0
-    return centroid[kept], share[kept] * volume[kept.reshape(-1)]
-
-
-def _merged(share: np.ndarray, centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shares and centroids after parts smaller than `_SMALL` went to the neighbour, across a face, of the largest part.
-    A part without such a neighbour stays."""
+    share, centroid = share.reshape(number), centroid.reshape(*number, -1)
+    # parts smaller than `_SMALL` go to the neighbour, across a face, of the largest part; without one they stay
     small = (share > 0) & (share < _SMALL)
     padded = np.pad(share, 1)
     middle = (slice(1, -1),) * share.ndim
@@ -221,7 +213,8 @@ def _merged(share: np.ndarray, centroid: np.ndarray) -> tuple[np.ndarray, np.nda
     total, moment = np.where(small, 0, share), np.where(small[..., None], 0, share[..., None] * centroid)
     np.add.at(total, target, share[small])
     np.add.at(moment, target, share[small][:, None] * centroid[small])
-    return total, moment / np.where(total > 0, total, 1)[..., None]
+    kept = total > 0
+    return moment[kept] / total[kept][:, None], total[kept] * volume[kept.reshape(-1)]
 
 
 def _particles(x: np.ndarray, volume: np.ndarray, density: Scalar, velocity: Velocity, dtype: Any) -> Particles:

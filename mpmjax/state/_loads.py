@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Float, NodeVector, ParticleVector, Point, Scalar
+from mpmjax._types import Array, Float, NodeVector, ParticleVector, Point, Scalar, components
 from mpmjax.checks import require, require_fields, require_that
 from mpmjax.discretisation import Stencil
 from mpmjax.geometry import (
@@ -24,7 +24,7 @@ from mpmjax.geometry import (
 )
 from mpmjax.material import AbstractLaw
 from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Forces
-from mpmjax.state._attachment import AbstractPlace, AttachedPoints, LoadedPoints, loaded_points
+from mpmjax.state._attachment import AbstractPlace, AttachedPoints, LoadedPoints, keeps_deformation
 from mpmjax.state._particles import Particles
 
 
@@ -51,11 +51,7 @@ class AbstractLoad(eqx.Module):
         return None
 
     def check(self, dim: int) -> None:
-        """Check that it can stand in a scene of a dimension. Default: the place has that dimension.
-
-        Raises:
-            ValueError: it cannot.
-        """
+        """Raise a `ValueError` if it cannot stand in a scene of a dimension. Default: the place has another one."""
         name = type(self).__name__
         require(
             self.on.dim == dim, f"{name} must be on a place with {dim} coordinates, as the grid, got {self.on.dim}."
@@ -169,12 +165,9 @@ class Support(AbstractSpring):
     """Springs ½ k_s (e_s + N_s u)² between points and the ground, and dashpots of resistance Σ_s N_sᵀ c_s N_s v."""
 
     points: LoadedPoints
-    stiffness: Float[Array, "d s"]
-    """k_s in each direction [N/m]."""
-    stretch: Float[Array, "d s"]
-    """e_s [m], at the start of the step."""
-    damping: Float[Array, "d s"] | None
-    """c_s [N s/m]; None without dashpots."""
+    stiffness: Float[Array, "d s"]  # k_s in each direction [N/m]
+    stretch: Float[Array, "d s"]  # e_s [m], at the start of the step
+    damping: Float[Array, "d s"] | None  # c_s [N s/m]; None without dashpots
 
     def elongation(self, moved: Displacement) -> Float[Array, "d s"]:
         return self.points.displacement(moved)
@@ -275,18 +268,44 @@ def points_of(
     *,
     total: bool,
 ) -> tuple[LoadedPoints, ...]:
-    """The points of each load at the start of a step."""
-    places = [load.on for load in loads if isinstance(load.on, AttachedPoints)]  # `prepare` refuses others
-    return tuple(loaded_points(on, laws, particles, stencil, total=total) for on in places)
+    """The points of each load of prepared particles at the start of a step."""
+    dtype, F = particles.x.dtype, None
+    if any(keeps_deformation(law) for law in laws):
+        still, parts = jnp.eye(particles.dim, dtype=dtype), []  # the identity where a law does not keep it
+        for law, stored, count in zip(laws, particles.deformations, particles.sizes, strict=True):
+            whole = keeps_deformation(law) and stored is not None
+            parts.append(jnp.asarray(stored) if whole else jnp.broadcast_to(still, (count, *still.shape)))
+        F = jnp.concatenate(parts)
+
+    def at(on: AttachedPoints) -> LoadedPoints:
+        rows = jnp.asarray(on.particle, dtype).astype(jnp.int32)
+        offset = jnp.asarray(on.offset, dtype).T
+        deformation = None if F is None else components(F[rows])
+        arm = offset if deformation is None else la.matmul(deformation, offset[:, None])[:, 0]
+        r = offset if total else arm
+        v, rate = components(particles.v[rows]), None
+        if particles.C is not None:
+            C = components(particles.C[rows])
+            v = v + la.matmul(C, r[:, None])[:, 0]
+            rate = None if deformation is None else C if total else la.matmul(C, deformation)
+        return LoadedPoints(
+            x=components(particles.x[rows]) + arm,
+            v=v,
+            deformation=deformation,
+            rate=rate,
+            place=jnp.asarray(on.place, dtype).T,
+            weight=jnp.asarray(on.weight, dtype),
+            area=None if on.area is None else jnp.asarray(on.area, dtype).T,
+            arm=r,
+            stencil=stencil.of(rows),
+            particle=rows,
+        )
+
+    return tuple(at(load.on) for load in loads if isinstance(load.on, AttachedPoints))  # `prepare` refuses others
 
 
 def load_force(
-    loads: tuple[AbstractLoad, ...],
-    points: tuple[LoadedPoints, ...],
-    t: Scalar,
-    dt: Scalar,
-    part: float,
-    size: int,
+    loads: tuple[AbstractLoad, ...], points: tuple[LoadedPoints, ...], t: Scalar, dt: Scalar, part: float, size: int
 ) -> NodeVector | None:
     """The forces of loads at their points at the fraction `part` of the step from t, on n = `size` nodes [N], shape
     (n, d), without those of their terms; None without any."""

@@ -130,12 +130,9 @@ def _only(each: tuple, name: str, field: str) -> Any:
 class Group(NamedTuple):
     """The particles of one material."""
 
-    rows: tuple[int, int]
-    """First particle, and the one after the last."""
-    stored: Float[Array, "q ..."] | None
-    """Their entry of `Particles.deformations`."""
-    history: Any
-    """Leaves of shape (q,)."""
+    rows: tuple[int, int]  # first particle, and the one after the last
+    stored: Float[Array, "q ..."] | None  # their entry of `Particles.deformations`
+    history: Any  # leaves of shape (q,)
 
     def deformation(self) -> Deformation:
         """F component first, shape (d, d, q), or J, shape (q,); a ValueError if the particles are not prepared."""
@@ -231,15 +228,7 @@ class State(eqx.Module):
     deformations: Deformations
     histories: tuple[Any, ...]
 
-    @property
-    def F(self) -> Any:  # noqa: N802
-        """The deformation of the only material (see `Particles.F`)."""
-        return _only(self.deformations, "F", "deformations")
-
-    @property
-    def history(self) -> Any:
-        """The history of the only material."""
-        return _only(self.histories, "history", "histories")
+    F, history = Particles.F, Particles.history
 
 
 def by_material(held: Particles | State) -> list[tuple[slice, Any, Any]]:

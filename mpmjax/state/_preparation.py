@@ -30,18 +30,13 @@ from mpmjax.state._setup_warnings import warn_of_setup
 
 _FLAT_POWER = 0.6
 """Power of the rounding ε: neighbours whose spread in a direction is ε^0.6 of a whole stencil's say nothing of it."""
-_ROUNDING = 1e3
-"""Changes of velocity over a spacing below so many roundings are set to zero."""
+_ROUNDING = 1e3  # changes of velocity over a spacing below so many roundings are set to zero
 
 
 @checked
 def attach(scene: Scene, particles: Particles) -> Scene:
     """The scene with its loads attached to the particles as they are: each `Patch` of a surface and all `PointsAt`
     become points that move with the nearest particle.
-
-    Args:
-        scene: the scene.
-        particles: its particles at the start.
 
     Raises:
         ValueError: a place with no surface, or with a point off the body; particles inside a jax transformation.

@@ -34,9 +34,8 @@ from mpmjax.discretisation import (
 from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw, Freedom
 from mpmjax.potential import MirrorPlace, carried_by
-from mpmjax.state._averaged_volume import AveragedVolume, VolumeAverage, volume_average
 from mpmjax.state._loads import AbstractBodyForce, AbstractLoad
-from mpmjax.state._material_points import MaterialPoints
+from mpmjax.state._material_points import AveragedVolume, MaterialPoints, VolumeAverage, volume_average
 from mpmjax.state._particles import Particles, State, with_state
 
 
@@ -117,12 +116,9 @@ class Bodies(eqx.Module):
 class RigidMaterial(NamedTuple):
     """A material that is a rigid body."""
 
-    number: int
-    """Index among the scene's materials."""
-    layer: int
-    """The layer of nodes that it moves."""
-    freedom: Freedom
-    """Degrees of freedom."""
+    number: int  # index among the scene's materials
+    layer: int  # the layer of nodes that it moves
+    freedom: Freedom  # degrees of freedom
 
 
 class Scene(eqx.Module):
@@ -240,13 +236,10 @@ class Scene(eqx.Module):
                 "The total description keeps the deformation from the start, which what yields or flows does not know: "
                 f"use the updated one for {', '.join(flowing)}.",
             )
-
         if self.volume is not None:
             self.volume.check(self.laws)
-        if self.rigid_bodies:
-            self._check_rigid()
-
-    def _check_rigid(self) -> None:
+        if not (rigid := self.rigid_bodies):
+            return
         require(
             not self.total,
             "A Rigid body needs nodes of its own, which the total description has not: use the updated one, or "
@@ -254,7 +247,7 @@ class Scene(eqx.Module):
         )
         numbers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
         require(
-            all(numbers.count(body.layer) == 1 for body in self.rigid_bodies),
+            all(numbers.count(body.layer) == 1 for body in rigid),
             "A Rigid body must be of one material alone, and no other material of its body: give the scene bodies, "
             f"Bodies() or with of_materials in which its number appears once, got {numbers}.",
         )
@@ -269,7 +262,7 @@ class Scene(eqx.Module):
             "A SymmetryPlane that moves cannot stand in a scene with a Rigid body: take a SeparatingCollider, or a "
             "plane at rest.",
         )
-        for directions in (body.freedom.directions for body in self.rigid_bodies):
+        for directions in (body.freedom.directions for body in rigid):
             require(
                 directions is None or len(directions) == self.grid.dim,
                 f"Rigid's free directions must be {self.grid.dim} bools, as the grid has directions, got {directions}.",
@@ -284,10 +277,8 @@ class Scene(eqx.Module):
     def rigid_bodies(self) -> tuple[RigidMaterial, ...]:
         """The materials that are rigid bodies."""
         layers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
-        candidates = (
-            (number, layer, law.freedom) for number, (law, layer) in enumerate(zip(self.laws, layers, strict=True))
-        )
-        return tuple(RigidMaterial(n, layer, freedom) for n, layer, freedom in candidates if freedom is not None)
+        each = enumerate(zip(self.laws, layers, strict=True))
+        return tuple(RigidMaterial(n, layer, f) for n, (law, layer) in each if (f := law.freedom) is not None)
 
     @property
     def guides(self) -> dict[int, int]:
@@ -313,19 +304,15 @@ class Scene(eqx.Module):
             )
             for law, group in zip(self.laws, particles.groups, strict=True)
         )
-        return materials if self.volume is None else self._averaged(self.volume, materials, particles, t)
-
-    def _averaged(
-        self, volume: AveragedVolume, materials: tuple[MaterialPoints, ...], particles: Particles, t: Scalar
-    ) -> tuple[MaterialPoints, ...]:
-        """The materials, with the averages of those whose volumes are averaged."""
+        if (averaged := self.volume) is None:
+            return materials
         grid, window, places = self.grid.with_layers(1), self.window(particles), self.on_grid(particles, t)
         images = mirror(self.boundary, grid, window).without_ties()
 
         def average(points: MaterialPoints) -> VolumeAverage:
             return volume_average(grid, window, places[slice(*points.rows)], points.volume, images)
 
-        return tuple(replace(q, average=average(q)) if volume.covers(i) else q for i, q in enumerate(materials))
+        return tuple(replace(q, average=average(q)) if averaged.covers(i) else q for i, q in enumerate(materials))
 
     def return_map(self, particles: Particles, dt: Scalar) -> Particles:
         """The particles after the return maps of laws that yield: from the trial deformation to one that the law

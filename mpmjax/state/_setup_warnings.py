@@ -5,8 +5,6 @@ still reach is not.
 """
 
 import itertools
-from collections.abc import Iterator
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -16,61 +14,92 @@ import numpy as np
 from mpmjax._types import Array, Bool, Int, ParticleVector
 from mpmjax.boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.checks import warn
-from mpmjax.discretisation import BSpline, Grid
+from mpmjax.discretisation import Grid
 from mpmjax.state._particles import Particles
 from mpmjax.state._scene import Scene
 
-_CROWDED = 1.25
-"""How many times the space that there is particles may take."""
+_CROWDED = 1.25  # how many times the space that there is particles may take
 _MOST_BEYOND = 0.05
 """Part of all volume that may lie beyond that after a run: in a splash of water or a heap of sand it is up to 0.03, in
 a vessel whose lowest layer of cells holds twice what fits 0.05 and more."""
-_MOST_CELLS = 10**7
-"""Cells up to which it is looked for."""
-_THIN = 2.0
-"""A body thinner than so many cells is not resolved."""
+_MOST_CELLS = 10**7  # cells up to which it is looked for
+_THIN = 2.0  # a body thinner than so many cells is not resolved
 _MOST_ROUNDING = 2.0**-12
 """Rounding of positions, in spacings, up to which it is not warned of: some 2 000 cells from zero in float32."""
-Boundaries = tuple[AbstractBoundary, ...]
 
 
 def warn_of_setup(scene: Scene, particles: Particles) -> None:
     """Warn of walls and colliders that lie over the body, of grips and colliders that touch nothing, of thin bodies;
     the floats of the scene are arrays."""
     grid, boundary, total = scene.grid.with_layers(1), scene.boundary, scene.total  # all bodies' nodes coincide
+    dx, free, d = float(grid.spacing), np.asarray(grid.periodic), grid.dim
+    x, volume = np.asarray(particles.x), np.asarray(particles.volume)
     resting = tuple(c.rests(total=total) and not grid.follow for c in boundary)
-    probe, inputs = partial(_probe, resting=resting, total=total), (boundary, grid, particles.x, particles.volume)
-    some = jax.tree.leaves(eqx.filter_eval_shape(probe, *inputs))  # none, and no compiling, of walls
-    within, touched = eqx.filter_jit(probe)(*inputs) if some else ([None] * len(boundary),) * 2
+    inputs = boundary, grid, particles.x, particles.volume, resting, total
+    some = jax.tree.leaves(eqx.filter_eval_shape(_probe, *inputs))  # none, and no compiling, of walls
+    within, touched = eqx.filter_jit(_probe)(*inputs) if some else ([None] * len(boundary),) * 2
+    first = (np.asarray(grid.origin) - 1) * dx
+    last = first + (np.asarray(grid.shape) + 1) * dx
     for number, (condition, inside, mask) in enumerate(zip(boundary, within, touched, strict=True), 1):
-        name = f"{type(condition).__name__} (boundary {number})"
-        covered = _count_beyond(condition, grid, particles) if inside is None else int(inside)
-        if covered and condition.pushes:
+        name, walls = f"{type(condition).__name__} (boundary {number})", condition.walls()
+        if inside is None:
+            nearest = np.asarray(_nearest(condition, grid, particles.volume))
+            beyond = [wall.inward * (x[:, wall.axis] - wall.position) < nearest for wall in walls]
+            inside = np.any(beyond, axis=0).sum()
+        if inside and condition.pushes:
             warn(
-                f"{covered} of {particles.count} particles lie in or beyond the {name} at the start, or nearer to it "
+                f"{inside} of {particles.count} particles lie in or beyond the {name} at the start, or nearer to it "
                 "than a quarter of their width: it pushes their faces away, half a width before their centres. Move "
                 "one of them."
             )
-        elif covered:
+        elif inside:
             warn(
-                f"{covered} of {particles.count} particles lie in or beyond the {name} at the start: nodes there do "
+                f"{inside} of {particles.count} particles lie in or beyond the {name} at the start: nodes there do "
                 "not move freely. Move one of them; to hold a body on purpose take a Grip."
             )
         if mask is not None:
             may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
-            if not (mask if may_meet else np.asarray(mask)[_reached(grid, scene.kernel, particles.x)]).any():
+            if not may_meet:  # only the nodes in a particle's stencil
+                base = np.asarray(scene.kernel.base(particles.x / grid.spacing)) - np.asarray(grid.window(particles.x))
+                reached = np.zeros(grid.shape, dtype=bool)
+                for offset in itertools.product(range(scene.kernel.order + 1), repeat=d):
+                    reached[tuple(((base + offset).astype(int) % grid.shape).T)] = True
+                mask = np.asarray(mask)[reached.reshape(-1)]
+            if not mask.any():
                 where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
                 warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")
-        elif _stays_outside(condition, grid):
+            continue
+        # whether its body, or each of its walls, is outside of a window that rests at all times; moving walls may come
+        if (reach := condition.reach()) is not None:
+            outside = bool((((reach[1] < first) | (reach[0] > last)) & ~free).any())
+        else:
+            beside = [not free[w.axis] and not first[w.axis] <= w.position <= last[w.axis] for w in walls]
+            outside = bool(beside) and all(beside) and getattr(condition, "motion", None) is None
+        if outside and not grid.follow:
             warn(f"The {name} touches nothing, since it never comes into the grid's window: move it or the grid.")
-    filled = _filled(particles.x, np.asarray(particles.volume, float), 2 * _widest(grid, particles))
+    filled = _filled(x, volume.astype(float), 2 * max(dx, float(volume.max()) ** (1 / d)))
     if filled is not None and filled[0].max() >= _CROWDED:
         warn(
             f"Near {filled[1]} m particles take {filled[0].max():.2g} times the space that there is: where two sets "
             "fill the same place there is twice the mass. Leave one of them out there."
         )
-    for text in _thin(grid, boundary, particles):
-        warn(text)
+    side = volume ** (1 / d)
+    for number, group in enumerate(particles.groups, 1):
+        rows = slice(*group.rows)
+        half = side[rows, None] / 2
+        lower, upper = (x[rows] - half).min(axis=0), (x[rows] + half).max(axis=0)
+        for axis in range(d):
+            thickness = (upper[axis] - lower[axis]) / dx
+            if thickness >= _THIN - 1e-3 or free[axis]:
+                continue
+            walls = (wall for condition in boundary for wall in condition.walls() if wall.axis == axis)
+            if any(lower[axis] - dx <= wall.position <= upper[axis] + dx for wall in walls):
+                continue  # a wall or plane lies beside it
+            which = "The body" if particles.counts is None else f"The body of material {number}"
+            warn(
+                f"{which} is {thickness:.2g} cells thick in direction {axis}, and below {_THIN:g} its stiffness is the "
+                "grid's: take a smaller spacing."
+            )
     warn_of_rounding(grid, particles.x)
 
 
@@ -96,7 +125,7 @@ def warn_of_crowding(scene: Scene, particles: Particles) -> None:
     ratio = np.concatenate([np.asarray(law.compaction(g.history)) * np.asarray(g.volume_ratio()) for law, g in groups])
     volume, side = np.asarray(particles.volume, float) * ratio, float(particles.volume.max()) ** (1 / particles.dim)
     for offset in (0.0, 0.5):  # a layer between two rows of nodes shows less
-        filled = _filled(particles.x, volume, max(float(scene.grid.spacing), 2 * side), offset)
+        filled = _filled(np.asarray(particles.x), volume, max(float(scene.grid.spacing), 2 * side), offset)
         beyond = 0.0 if filled is None else np.maximum(filled[0] - _CROWDED, 0).sum() / filled[0].sum()
         if filled is not None and beyond > _MOST_BEYOND:
             warn(
@@ -109,7 +138,12 @@ def warn_of_crowding(scene: Scene, particles: Particles) -> None:
 
 
 def _probe(
-    boundary: Boundaries, grid: Grid, x: ParticleVector, volume: Array, *, resting: tuple[bool, ...], total: bool
+    boundary: tuple[AbstractBoundary, ...],
+    grid: Grid,
+    x: ParticleVector,
+    volume: Array,
+    resting: tuple[bool, ...],
+    total: bool,
 ) -> tuple[list[Int[Array, ""] | None], list[Bool[Array, "n"] | None]]:
     """How many particles lie in each body at the start, in the updated description; and on which nodes each boundary
     acts that rests."""
@@ -133,42 +167,11 @@ def _probe(
 def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Array) -> Array:
     """How near particles may start to what holds or pushes them [m], (p,): to what pushes their faces, a quarter of
     their width."""
-    if boundary.pushes:
-        return volume ** (1 / grid.dim) / 4
-    return jnp.full(volume.shape, -ON_THE_WALL * grid.spacing)
-
-
-def _count_beyond(boundary: AbstractBoundary, grid: Grid, particles: Particles) -> int:
-    """How many particles lie beyond its walls, or too near to walls that push."""
-    nearest, places = np.asarray(_nearest(boundary, grid, particles.volume)), np.asarray(particles.x)
-    outside = np.zeros(len(places), bool)
-    for wall in boundary.walls():
-        outside |= wall.inward * (places[:, wall.axis] - wall.position) < nearest
-    return int(outside.sum())
-
-
-def _stays_outside(boundary: AbstractBoundary, grid: Grid) -> bool:
-    """Whether its body, or each of its walls, is outside of a window that rests at all times. Walls that move may come
-    in."""
-    dx, free = float(grid.spacing), np.asarray(grid.periodic)
-    first = np.asarray(grid.origin) * dx - dx
-    last = first + (np.asarray(grid.shape) + 1) * dx
-    walls, reach = boundary.walls(), boundary.reach()
-    if grid.follow or (reach is None and getattr(boundary, "motion", None) is not None):
-        return False
-    if reach is not None:
-        return bool((((reach[1] < first) | (reach[0] > last)) & ~free).any())
-    beside = [not free[w.axis] and not first[w.axis] <= w.position <= last[w.axis] for w in walls]
-    return bool(beside) and all(beside)
-
-
-def _widest(grid: Grid, particles: Particles) -> float:
-    """The spacing, or the side of the largest particle if that is more [m]."""
-    return max(float(grid.spacing), float(np.asarray(particles.volume).max()) ** (1 / particles.dim))
+    return volume ** (1 / grid.dim) / 4 if boundary.pushes else jnp.full_like(volume, -ON_THE_WALL * grid.spacing)
 
 
 def _filled(
-    x: ParticleVector, volume: np.ndarray, width: float, offset: float = 0.0
+    x: np.ndarray, volume: np.ndarray, width: float, offset: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """How many times its space each node of a lattice holds, by linear weights, which those of one body fill to a
     tenth, and where the fullest is [m]; None where that is too much to look for. The lattice has a spacing `width` [m],
@@ -187,35 +190,3 @@ def _filled(
         share_filled += np.bincount(node, weight * volume, share_filled.size)
     fullest = np.asarray(np.unravel_index(int(share_filled.argmax()), shape))
     return share_filled / width**d, (fullest + first - offset) * width
-
-
-def _reached(grid: Grid, kernel: BSpline, x: ParticleVector) -> np.ndarray:
-    """Which nodes of the window, (n,), lie in a particle's stencil."""
-    shape = np.asarray(grid.shape)
-    first = np.asarray(kernel.base(x / grid.spacing)) - np.asarray(grid.window(x))
-    reached = np.zeros(grid.shape, dtype=bool)
-    for offset in itertools.product(range(kernel.order + 1), repeat=grid.dim):
-        reached[tuple(((first + offset).astype(int) % shape).T)] = True
-    return reached.reshape(-1)
-
-
-def _thin(grid: Grid, boundary: Boundaries, particles: Particles) -> Iterator[str]:
-    """Warnings of materials less than two cells thick in a direction in which no wall or plane lies beside them."""
-    dx, places = float(grid.spacing), np.asarray(particles.x)
-    side = np.asarray(particles.volume) ** (1 / grid.dim)
-    ends = np.cumsum([0, *particles.sizes])
-    for number, (start, stop) in enumerate(itertools.pairwise(ends), 1):
-        half = side[start:stop, None] / 2
-        lower, upper = (places[start:stop] - half).min(axis=0), (places[start:stop] + half).max(axis=0)
-        for axis in range(grid.dim):
-            thickness = (upper[axis] - lower[axis]) / dx
-            if thickness >= _THIN - 1e-3 or grid.periodic[axis]:
-                continue
-            walls = (wall for condition in boundary for wall in condition.walls() if wall.axis == axis)
-            if any(lower[axis] - dx <= wall.position <= upper[axis] + dx for wall in walls):
-                continue
-            which = "The body" if particles.counts is None else f"The body of material {number}"
-            yield (
-                f"{which} is {thickness:.2g} cells thick in direction {axis}, and below {_THIN:g} its stiffness is the "
-                "grid's: take a smaller spacing."
-            )

@@ -2,10 +2,11 @@
 it."""
 
 from mpmjax.verification._check_law import check_law as check_law, tension as tension
-from mpmjax.verification._column import Column as Column, HenckyColumn as HenckyColumn
 from mpmjax.verification._exact_problem import (
     AbstractProblem as AbstractProblem,
+    Column as Column,
     Ends as Ends,
+    HenckyColumn as HenckyColumn,
     Manufactured as Manufactured,
     discretise as discretise,
     displacement_error as displacement_error,

@@ -29,15 +29,8 @@ def draw_fit(
     predictions: tuple[Prediction, ...] | None = None,
 ) -> Path:
     """Data, the fitted simulation and its bands, residuals in units of the noise, the misfit of each iteration, and
-    profiles.
-
-    Args:
-        result: the fit.
-        path: the picture.
-        measured: the fitted experiments with more data, or longer: the fit predicts what it was not given.
-        profiles: of the fit's parameters.
-        predictions: those of `measured`, where they are known already.
-    """
+    profiles. `measured` are the fitted experiments with more data, or longer, which the fit predicts, `predictions`
+    those of them, where they are known already."""
     from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
 
     shown = measured or result.experiments
@@ -52,8 +45,24 @@ def draw_fit(
         left, right = figure.add_subplot(grid[row, :4]), figure.add_subplot(grid[row, 4:])
         _draw_observation(left, right, observation, predicted, float(used.against[1].max()))
     row = len(observations)
-    _draw_history(figure.add_subplot(grid[row, :2]), result)
-    _write_numbers(figure.add_subplot(grid[row, 2:]), result, profiles)
+    axis: Any = figure.add_subplot(grid[row, :2])
+    last = max(i for i, iteration in enumerate(result.history) if iteration.number == 0)
+    axis.semilogy([2 * iteration.cost for iteration in result.history[last:]], "o-", color="0.3", markersize=3, lw=1)
+    axis.set(xlabel="iteration" if last == 0 else "iteration of the last search", ylabel="Σ r²")
+    axis.xaxis.get_major_locator().set_params(integer=True)
+    axis = figure.add_subplot(grid[row, 2:])  # the estimates with their intervals, and warnings
+    by_profile = {p.label: p.interval for p in profiles}
+    wide = max(len(e.name) for e in result.all)
+    lines = [f"{'':<{wide}}{'value':>12} ± {'error':<9}{100 * result.level:g} % interval"]
+    for e in result.all:
+        lower, upper = by_profile.get(e.label, e.interval)
+        profiled = (" by profile" if e.label in by_profile else "") + (", at its bound" if e.at_bound else "")
+        lines.append(f"{e.name:<{wide}}{e.value:>12.5g} ± {e.error:<9.2g}{lower:.5g} to {upper:.5g}{profiled}")
+    lines += ["", f"χ² = {result.chi_squared:.4g}, {result.degrees_of_freedom} degrees of freedom"]
+    axis.axis("off")
+    axis.text(0, 1, "\n".join(lines), va="top", fontsize=7.5, family="monospace", transform=axis.transAxes)
+    texts = [*result.warnings, *(text for p in profiles for text in p.warnings)]
+    axis.text(0, 0, "\n".join(texts), va="bottom", fontsize=7, wrap=True, color="C3", transform=axis.transAxes)
     for number, profile in enumerate(profiles):
         below, along = divmod(number, _PROFILES_A_ROW)
         _draw_profile(figure.add_subplot(grid[row + 1 + below, 2 * along : 2 * along + 2]), profile)
@@ -108,32 +117,6 @@ def _draw_observation(
     right.set(xlabel=name, ylabel="(fit − measured) / σ")
 
 
-def _draw_history(axis: Any, result: FitResult) -> None:
-    """The misfit of each iteration of the last search."""
-    last = max(i for i, iteration in enumerate(result.history) if iteration.number == 0)
-    misfit = [2 * iteration.cost for iteration in result.history[last:]]
-    axis.semilogy(misfit, "o-", color="0.3", markersize=3, linewidth=1)
-    axis.set(xlabel="iteration" if last == 0 else "iteration of the last search", ylabel="Σ r²")
-    axis.xaxis.get_major_locator().set_params(integer=True)
-
-
-def _write_numbers(axis: Any, result: FitResult, profiles: tuple[Profile, ...]) -> None:
-    """The estimates with their intervals, and what is to be said of them."""
-    by_profile = {p.label: p.interval for p in profiles}
-    wide = max(len(e.name) for e in result.all)
-    lines = [f"{'':<{wide}}{'value':>12} ± {'error':<9}{100 * result.level:g} % interval"]
-    for e in result.all:
-        lower, upper = by_profile.get(e.label, e.interval)
-        profiled = (" by profile" if e.label in by_profile else "") + (", at its bound" if e.at_bound else "")
-        lines.append(f"{e.name:<{wide}}{e.value:>12.5g} ± {e.error:<9.2g}{lower:.5g} to {upper:.5g}{profiled}")
-    degrees = result.degrees_of_freedom
-    lines += ["", f"χ² = {result.chi_squared:.4g}, {degrees} degrees of freedom"]
-    axis.axis("off")
-    axis.text(0, 1, "\n".join(lines), va="top", fontsize=7.5, family="monospace", transform=axis.transAxes)
-    texts = [*result.warnings, *(text for p in profiles for text in p.warnings)]
-    axis.text(0, 0, "\n".join(texts), va="bottom", fontsize=7, wrap=True, color="C3", transform=axis.transAxes)
-
-
 def _draw_profile(axis: Any, profile: Profile) -> None:
     """Δχ² over the parameter, its threshold, and the interval; dashed, the interval of the standard error."""
     from scipy.interpolate import PchipInterpolator
@@ -163,15 +146,7 @@ def write_fit(
 ) -> Path:
     """The numbers of a fit as JSON: estimates with errors and intervals, correlations, noise, χ², iterations,
     predictions with bands, and profiles. Of a fit on several grids, the extrapolated estimates, and those numbers of
-    each grid. Numbers that are not finite are null.
-
-    Args:
-        result: the fit.
-        path: the file.
-        measured: see `draw_fit`; of the finest grid.
-        profiles: of the fit's parameters; of the finest grid.
-        predictions: those of `measured`, where they are known already.
-    """
+    each grid, `measured` and profiles (see `draw_fit`) of the finest. Numbers that are not finite are null."""
     if isinstance(result, RefinedFit):
         *coarser, finest = result.fits
         numbers: dict[str, Any] = {
@@ -197,49 +172,29 @@ def _numbers(
 ) -> dict[str, Any]:
     observations = [o for e in measured or result.experiments for o in e.observations]
     predictions = predict_observations(result, measured or None) if predictions is None else predictions
+    plain = ("correlation", "chi_squared", "p_value", "degrees_of_freedom", "level", "converged", "interrupted")
+    bands = ("value", "error", "lower", "upper", "sigma", "new_lower", "new_upper")
+    of_profile = ("label", "interval", "threshold", "degrees_of_freedom", "level", "warnings")
     return {
         "estimates": [e._asdict() for e in result.all],
-        "correlation": result.correlation,
         "fisher_spectrum": result.spectrum,
         "covariance_of_coordinates": result.covariance,
         "fisher_directions": result.directions,
-        "chi_squared": result.chi_squared,
-        "p_value": result.p_value,
-        "degrees_of_freedom": result.degrees_of_freedom,
-        "level": result.level,
+        **{name: getattr(result, name) for name in plain},
         "noise": [n._asdict() for n in result.noise],
-        "predictions": [_predicted(o, p) for o, p in zip(observations, predictions, strict=True)],
-        "profiles": [_profiled(p) for p in profiles],
-        "converged": result.converged,
+        "predictions": [
+            {"name": o.name, "against": o.against[0], "x": o.against[1], "measured": o.data}
+            | {name: getattr(p, name) for name in bands}
+            for o, p in zip(observations, predictions, strict=True)
+        ],
+        "profiles": [
+            {name: getattr(p, name) for name in of_profile}
+            | {"symmetric_interval": p.symmetric, "delta_chi_squared": p.statistic}
+            | {"numbers": {label: p.along(label) for label in p.labels}}
+            for p in profiles
+        ],
         "iterations": [i._asdict() for i in result.history],
-        "interrupted": result.interrupted,
         "warnings": result.warnings,
-    }
-
-
-def _predicted(observation: AbstractObservation, predicted: Prediction) -> dict[str, object]:
-    """An observation's data and prediction, rows over what it was measured against."""
-    name, x = observation.against
-    return {
-        "name": observation.name,
-        "against": name,
-        "x": x,
-        "measured": observation.data,
-        **{f: getattr(predicted, f) for f in ("value", "error", "lower", "upper", "sigma", "new_lower", "new_upper")},
-    }
-
-
-def _profiled(profile: Profile) -> dict[str, object]:
-    return {
-        "label": profile.label,
-        "interval": profile.interval,
-        "symmetric_interval": profile.symmetric,
-        "threshold": profile.threshold,
-        "degrees_of_freedom": profile.degrees_of_freedom,
-        "level": profile.level,
-        "delta_chi_squared": profile.statistic,
-        "numbers": {label: profile.along(label) for label in profile.labels},
-        "warnings": profile.warnings,
     }
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from scipy import ndimage
 
 from mpmjax.analysis import WorkPrecision, energy_density, name_of, volume_ratio
-from mpmjax.boundary import Wall
 from mpmjax.checks import canonical, checked, require, require_between, require_memory
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
@@ -26,10 +25,8 @@ COLOURS: dict[str, tuple[str, Callable[[Run, Particles], Any]]] = {
 """The quantities that can colour particles: a label, and a value for each particle."""
 
 SNOW, OCHRE, STEEL, MOSS = (0.91, 0.93, 0.96), (0.82, 0.55, 0.33), (0.36, 0.5, 0.66), (0.45, 0.62, 0.42)
-STONE = (0.55, 0.54, 0.52)
-"""The colour of walls and colliders."""
-_MOST_CELLS = 90
-"""Cells in a direction of the lattice by which particles are shaded."""
+STONE = (0.55, 0.54, 0.52)  # the colour of walls and colliders
+_MOST_CELLS = 90  # cells in a direction of the lattice by which particles are shaded
 
 Draw = Callable[[Particles, np.ndarray, float], None]
 
@@ -140,12 +137,6 @@ def _tinted(particles: Particles, bar: Any, values: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(values)[:, None], colours, bar.to_rgba(values)[:, :3])
 
 
-def _walls(scene: Scene) -> Iterator[Wall]:
-    """The walls and planes."""
-    for boundary in scene.boundary:
-        yield from boundary.walls()
-
-
 def _obstacles(scene: Scene, t: float) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
     """The signed distance [m] of points [m], (m, d), to each body where it is at time t."""
     dtype = jnp.zeros(()).dtype
@@ -158,14 +149,8 @@ def _obstacles(scene: Scene, t: float) -> Iterator[Callable[[np.ndarray], np.nda
 def skin(
     distance: Callable[[np.ndarray], np.ndarray], lower: np.ndarray, upper: np.ndarray, spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points on a shape's surface and its outward normals there, each (n, d), about a spacing apart.
-
-    Args:
-        distance: signed distance to the shape [m] of points (m, d), negative inside.
-        lower: lower corner of where to look [m], (d,).
-        upper: upper corner [m], (d,).
-        spacing: of the lattice whose points within a cell of the surface are moved onto it [m].
-    """
+    """Points on a shape's surface and its outward normals there, each (n, d), about a `spacing` apart [m], between
+    two corners [m], (d,), from the signed distance to the shape [m] of points (m, d), negative inside."""
     axes = [np.arange(a, b + spacing, spacing) for a, b in zip(lower, upper, strict=True)]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
     x = x[np.abs(distance(x)) < 0.5 * len(axes) ** 0.5 * spacing]
@@ -187,10 +172,8 @@ def _upright(scene: Scene) -> np.ndarray:
 def _bearing(scene: Scene, up: np.ndarray) -> float | None:
     """The height [m] of the highest wall or plane that bears what lies on it; None without any."""
     axis = int(np.abs(up).argmax())
-    heights = (
-        float(up[axis]) * wall.position for wall in _walls(scene) if wall.axis == axis and wall.inward == up[axis]
-    )
-    return max(heights, default=None)
+    walls = (w for b in scene.boundary for w in b.walls() if w.axis == axis and w.inward == up[axis])
+    return max((float(up[axis]) * wall.position for wall in walls), default=None)
 
 
 def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> tuple[Any, Draw]:
@@ -271,13 +254,8 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
 
 
 def _outward(x: np.ndarray, volume: np.ndarray) -> np.ndarray:
-    """The outward normals of a body at its particles [-], (p, 3): about 1 long at its surface, 0 in its inside. They
-    are the slope of how full the space is, on a lattice of cells as large as the particles.
-
-    Args:
-        x: positions [m], (p, 3).
-        volume: their volumes [m³], (p,).
-    """
+    """The outward normals of a body at its particles [-], (p, 3), at x [m]: about 1 long at its surface, 0 in its
+    inside. They are the slope of how full the space is, on a lattice of cells as large as the particles."""
     lower, upper = x.min(axis=0), x.max(axis=0)
     cell = max(float(volume.mean()) ** (1 / 3), float((upper - lower).max()) / _MOST_CELLS)
     place = (x - lower) / cell + 3.5
@@ -303,7 +281,7 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
     margin = float(volume.mean()) ** (1 / d)
     lower, upper = x.min(axis=0) - 2 * margin, x.max(axis=0) + 2 * margin
     extent = float((upper - lower).max())
-    walls = list(_walls(run.scene))
+    walls = [wall for boundary in run.scene.boundary for wall in boundary.walls()]
     for axis, at, *_ in walls:  # those near by are shown
         if lower[axis] - extent < at < upper[axis] + extent:
             lower[axis], upper[axis] = min(lower[axis], at - 0.03 * extent), max(upper[axis], at + 0.03 * extent)
