@@ -300,7 +300,7 @@ class FitProblem(eqx.Module):
 
 
 def linearised(function: Callable[[Coordinates], Any], z: Coordinates, at_once: int) -> tuple[Any, Any]:
-    """What a function returns, and its derivative by each coordinate, with a leading axis n: by forward mode, so many
+    """The value of a function, and its derivative by each coordinate, with a leading axis n: by forward mode, so many
     tangents at once."""
     units = jnp.eye(len(z), dtype=z.dtype)
     return _in_batches(lambda tangent: jax.jvp(function, (z,), (tangent,)), units, at_once)
