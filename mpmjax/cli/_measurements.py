@@ -136,8 +136,8 @@ def observation(
 
     keys.__signature__ = inspect.Signature([*special, *shared])  # pyright: ignore[reportFunctionMemberAccess]
     values = arguments(keys, {k: v for k, v in table.items() if k != "kind"}, f"{_HEADER} {kind}")
-    chosen = {p.name: values.pop(p.name) for p in shared if p.name in values}
-    made = make(Measurement(simulation=simulation, folder=folder, **{"time": ""} | chosen), **values)
+    chosen: dict[str, Any] = {"time": ""} | {p.name: values.pop(p.name) for p in shared if p.name in values}
+    made = make(Measurement(simulation=simulation, folder=folder, **chosen), **values)
     if isinstance(made, tuple):
         return made
     part = made.part_until(t1)
