@@ -30,9 +30,9 @@ Vectors<T> zeros(int64_t count) {
 // Calls run(i) for all numbers of the active blocks.
 template <class Run>
 void over_active(const bool* active, int64_t size, const Run& run) {
-  for (int64_t first = 0, k = 0; first < size; first += kTogether, ++k) {
+  for (int64_t first = 0, k = 0; first < size; first += kChunk, ++k) {
     if (!active[k]) continue;
-    const int64_t last = std::min(size, first + kTogether);
+    const int64_t last = std::min(size, first + kChunk);
     for (int64_t i = first; i < last; ++i) run(i);
   }
 }

@@ -2,15 +2,13 @@
 //
 //   combine   a, b, c, d, scales, weight, active             ->  y, z, sum
 //   product   force, v, mass, factor, free, weight, active   ->  image, sum
-//   slope     whole, means, by means [, by whole]            ->  by sums
 //   eigen     S                                              ->  w, V
 //   rotation  F                                              ->  R
 //   order     keys                                           ->  order
 //   rearrange wanted, order, numbers                         ->  numbers
 //   stored    any arrays                                     ->  the same
 //
-// Vectors are (..., m), scales (..., 2), mass and whole (..., n), means (..., n, c − 1), sums (..., n, c), active
-// (..., ⌈m/64⌉), matrices (..., 3, 3, p), w (..., 3, p), keys
+// Vectors are (..., m), scales (..., 2), mass (..., n), active (..., ⌈m/64⌉), matrices (..., 3, 3, p), w (..., 3, p), keys
 // and their order (..., p), wanted (...), numbers (..., c, p), with the same leading axes everywhere.
 
 #include <cstring>
@@ -18,7 +16,6 @@
 #include "call.h"
 #include "matrices.h"
 #include "order.h"
-#include "slope.h"
 #include "vectors.h"
 
 namespace mpmjax {
@@ -33,7 +30,7 @@ struct CombineOf {
     for (size_t k = 0; k < 4; ++k) *from[k] = call.at<T>(k, {task.size});
     task.scales = call.at<T>(4, {2});
     task.weight = call.at<T>(5, {task.size});
-    task.active = call.booleans(6, {(task.size + kTogether - 1) / kTogether});
+    task.active = call.booleans(6, {(task.size + kChunk - 1) / kChunk});
     task.y = call.at<T>(7, {task.size});
     task.z = call.at<T>(8, {task.size});
     task.sum = call.at<T>(9, {});
@@ -53,25 +50,12 @@ struct ProductOf {
     task.factor = call.at<T>(3, {});
     task.free = call.booleans(4, {task.size});
     task.weight = call.at<T>(5, {task.size});
-    task.active = call.booleans(6, {(task.size + kTogether - 1) / kTogether});
+    task.active = call.booleans(6, {(task.size + kChunk - 1) / kChunk});
     task.image = call.at<T>(7, {task.size});
     task.sum = call.at<T>(8, {});
     task.whole = true;
     call.expect(task.nodes > 0 ? task.size % task.nodes == 0 : task.size == 0, "nodes with unlike numbers of components");
     if (call.fault.empty()) product(pool, call.batch, task);
-  }
-};
-
-template <bool by_whole>
-struct SlopeOf {
-  template <class T>
-  void run(const Pool& pool, Call& call) const {
-    const int64_t n = call.dim(0, 1), others = call.dim(1, 1);
-    Slope<T> task = {call.at<T>(0, {n}), call.at<T>(1, {n, others}), call.at<T>(2, {n, others}), nullptr, nullptr, n,
-                     others + 1};
-    if (by_whole) task.by_whole = call.at<T>(3, {n});
-    task.by_sums = call.at<T>(by_whole ? 4 : 3, {n, others + 1});
-    if (call.fault.empty()) slope(pool, call.batch, task);
   }
 };
 
@@ -163,20 +147,16 @@ ffi::Error run_stored(ffi::RemainingArgs from, ffi::RemainingRets to) {
   Call call = collect(from, to);
   call.expect(call.buffers.size() == 2 * call.operands, "as many arrays as results");
   for (size_t k = 0; call.fault.empty() && k < call.operands; ++k) {
-    const ffi::AnyBuffer &given = call.buffers[k], &result = call.buffers[call.operands + k];
-    call.expect(given.size_bytes() == result.size_bytes(), "arrays of another size");
-    if (!call.fault.empty() || given.untyped_data() == result.untyped_data()) continue;
-    std::memcpy(result.untyped_data(), given.untyped_data(), given.size_bytes());
+    const ffi::AnyBuffer &values = call.buffers[k], &result = call.buffers[call.operands + k];
+    call.expect(values.size_bytes() == result.size_bytes(), "arrays of another size");
+    if (!call.fault.empty() || values.untyped_data() == result.untyped_data()) continue;
+    std::memcpy(result.untyped_data(), values.untyped_data(), values.size_bytes());
   }
   return call.fault.empty() ? ffi::Error::Success() : wrong(call.fault);
 }
 
 constexpr auto run_combine = run<CombineOf, 7, 3, 1>;
 constexpr auto run_product = run<ProductOf, 7, 2, 1>;
-ffi::Error run_slope(ffi::ThreadPool threads, ffi::RemainingArgs from, ffi::RemainingRets to) {
-  return from.size() == 3 ? run<SlopeOf<false>, 3, 1, 1>(threads, from, to) : run<SlopeOf<true>, 4, 1, 1>(threads, from, to);
-}
-
 constexpr auto run_eigen = run<EigenOf, 1, 2, 3>;
 constexpr auto run_rotation = run<RotationOf, 1, 1, 3>;
 
@@ -188,8 +168,6 @@ constexpr auto run_rotation = run<RotationOf, 1, 1, 3>;
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_combine, mpmjax::run_combine,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_product, mpmjax::run_product,
-                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
-XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_slope, mpmjax::run_slope,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_eigen, mpmjax::run_eigen,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());

@@ -38,7 +38,7 @@ template <class T, int d, int s>
 void average(const Average<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns, others = columns - 1;
   if (task.reached != nullptr) mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
-  over_alike(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
+  over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
     if (reached) {
       clear(task.sums, nullptr, from * columns, to * columns);
     } else {
@@ -46,9 +46,9 @@ void average(const Average<T>& task, int64_t first, int64_t last) {
       wipe(task.means, task.size * others, from * others, to * others);
     }
   });
-  const Scatter<T> sums = {task.stencils, task.given, task.sums, task.ranges, nullptr, task.size, columns, nullptr};
-  add_all<T, d, s, false>(sums, first, last);
-  over_alike(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
+  const Scatter<T> sums = {task.stencils, task.values, task.sums, task.ranges, nullptr, task.size, columns, nullptr};
+  add_all<T, d, s>(sums, first, last);
+  over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
     if (reached) divide_all(task, from, to);
   });
 }

@@ -44,7 +44,9 @@ struct Call {
   ffi::DataType type = ffi::DataType::INVALID;
   Shape leading;
   int64_t d = 0, s = 0, particles = 0, batch = 1;
-  bool placed = false;  // whether places are given in place of factors
+  // The basis: nodes along each axis, (d), whether it is periodic, and knots, (s), and coefficients, (s, terms).
+  ffi::Span<const int64_t> shape, periodic;
+  ffi::Span<const double> knots, weights, slopes;
   std::string fault;
 
   void expect(bool holds, const char* what) {
@@ -86,47 +88,44 @@ struct Call {
     return shape.size() >= from_behind ? shape[shape.size() - from_behind] : 0;
   }
 
-  // How many operands the stencils are.
-  size_t factors(bool differential) const { return placed ? 4 : differential ? 5 : 3; }
-
+  // The stencils: first nodes, offsets, and with `differential` what these change by.
   template <class T>
   Stencils<T> stencils(bool differential) {
-    Stencils<T> found = {};
-    if (placed) {
-      Places<T>& places = found.places;
-      expect(!differential, "a differential by the factors of places");
-      expect(shape_of(buffers[1]).size() == leading.size() + 1 && dim(1, 1) == d, "no stride for each axis");
-      expect(buffers[1].element_type() == ffi::DataType::S32, "strides that are no integers");
-      found.particles = particles;
-      places.first = static_cast<const int32_t*>(buffers[0].untyped_data());
-      places.strides = static_cast<const int32_t*>(buffers[1].untyped_data());
-      places.offset = at<T>(2, {d, particles});
-      places.polynomials = at<T>(3, {2, s, s + 2});
-      return found;
+    Stencils<T> result = {};
+    if (!fault.empty()) return result;
+    result.first = static_cast<const int32_t*>(buffers[0].untyped_data());
+    result.offset = at<T>(1, {d, particles});
+    if (differential) result.change = at<T>(2, {d, particles});
+    result.particles = particles;
+    Basis<T>& basis = result.basis;
+    for (int64_t a = d - 1, stride = 1; a >= 0; stride *= shape[a--]) {
+      basis.shape[a] = static_cast<int32_t>(shape[a]), basis.strides[a] = static_cast<int32_t>(stride);
+      basis.periodic[a] = periodic[a] != 0;
     }
-    found.index = static_cast<const int32_t*>(buffers[0].untyped_data());
-    found.particles = particles;
-    found.weights = at<T>(1, {d, s, particles});
-    found.derivatives = at<T>(2, {d, s, particles});
-    if (differential) {
-      found.weight_changes = at<T>(3, {d, s, particles});
-      found.derivative_changes = at<T>(4, {d, s, particles});
+    const int64_t terms = static_cast<int64_t>(weights.size()) / s;
+    basis.terms = static_cast<int>(terms);
+    for (int64_t i = 0; i < s; ++i) {
+      basis.knots[i] = static_cast<T>(knots[i]);
+      for (int64_t k = 0; k < terms; ++k) {
+        basis.weights[i][k] = static_cast<T>(weights[i * terms + k]);
+        basis.slopes[i][k] = static_cast<T>(slopes[i * terms + k]);
+      }
     }
-    return found;
+    return result;
   }
 
   // What particles give, of the operands from the k-th on.
   template <class T>
-  Given<T> given(size_t k, bool valued, int64_t columns) {
-    Given<T> found = {};
+  ParticleValues<T> values(size_t k, bool valued, int64_t columns) {
+    ParticleValues<T> result = {};
     expect(operands >= k && (operands == k + valued || operands == k + valued + 1), "too many or too few given");
-    if (fault.empty() && valued) found.value = at<T>(k, {columns, particles});
+    if (fault.empty() && valued) result.value = at<T>(k, {columns, particles});
     if (fault.empty() && operands == k + valued + 1) {
-      found.graded = dim(k + valued, 2);
-      expect(found.graded <= columns, "more columns of gradients than of nodes");
-      found.gradients = at<T>(k + valued, {d, found.graded, particles});
+      result.graded = dim(k + valued, 2);
+      expect(result.graded <= columns, "more columns of gradients than of nodes");
+      result.gradients = at<T>(k + valued, {d, result.graded, particles});
     }
-    return found;
+    return result;
   }
 };
 

@@ -79,16 +79,16 @@ struct Shape {
 inline int faults = 0;
 
 template <class T>
-void compare(const char* what, const Shape& sh, const Array<T>& found, const std::vector<double>& expected,
+void compare(const char* what, const Shape& sh, const Array<T>& result, const std::vector<double>& expected,
              const std::vector<double>& scale) {
   const double tolerance = 64 * std::numeric_limits<T>::epsilon();
-  for (int64_t i = 0; i < found.size; ++i) {
-    const double error = std::abs(found[i] - expected[i]);
-    const bool both = !std::isfinite(expected[i]) && !std::isfinite(found[i]);
+  for (int64_t i = 0; i < result.size; ++i) {
+    const double error = std::abs(result[i] - expected[i]);
+    const bool both = !std::isfinite(expected[i]) && !std::isfinite(result[i]);
     if (both || error <= tolerance * scale[i]) continue;
     if (++faults < 20) {
       std::printf("%s d=%d s=%d columns=%lld particles=%lld: [%lld] is %g, expected %g\n", what, sh.d, sh.s,
-                  (long long)sh.columns, (long long)sh.particles, (long long)i, double(found[i]), expected[i]);
+                  (long long)sh.columns, (long long)sh.particles, (long long)i, double(result[i]), expected[i]);
     }
     return;
   }

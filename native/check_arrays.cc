@@ -7,7 +7,6 @@
 #include "check.h"
 #include "matrices.h"
 #include "order.h"
-#include "slope.h"
 #include "vectors.h"
 
 namespace mpmjax {
@@ -16,14 +15,14 @@ namespace {
 // Vectors of which some blocks are zero, combined in place and elsewhere; whatever is passed over stays or becomes zero.
 template <class T>
 void check_vectors(int64_t size, bool in_place, std::mt19937& random, const std::vector<const Pool*>& pools) {
-  const int64_t batch = 2, blocks = (size + kTogether - 1) / kTogether;
+  const int64_t batch = 2, blocks = (size + kChunk - 1) / kChunk;
   std::normal_distribution<T> normal;
   const Array<T> a(batch * size), b(a.size), c(a.size), d(a.size), weight(a.size), scales(2 * batch), sum(batch);
   const Array<bool> active(batch * blocks);
   for (int64_t i = 0; i < active.size; ++i) active[i] = random() % 3 == 0;
   for (int64_t i = 0; i < a.size; ++i) {
     weight[i] = normal(random);
-    if (!active[i / size * blocks + i % size / kTogether]) continue;
+    if (!active[i / size * blocks + i % size / kChunk]) continue;
     a[i] = normal(random), b[i] = normal(random), c[i] = normal(random), d[i] = normal(random);
   }
   for (int64_t i = 0; i < scales.size; ++i) scales[i] = normal(random);
@@ -53,7 +52,7 @@ void check_vectors(int64_t size, bool in_place, std::mt19937& random, const std:
 // What is left of a product, in place; nothing is free and all is zero where blocks are passed over.
 template <class T>
 void check_product(int64_t nodes, int64_t each, std::mt19937& random, const std::vector<const Pool*>& pools) {
-  const int64_t batch = 2, size = nodes * each, blocks = (size + kTogether - 1) / kTogether;
+  const int64_t batch = 2, size = nodes * each, blocks = (size + kChunk - 1) / kChunk;
   std::normal_distribution<T> normal;
   const Array<T> force(batch * size), v(force.size), weight(force.size), mass(batch * nodes), factor(batch), sum(batch);
   const Array<bool> active(batch * blocks), free(force.size);
@@ -64,7 +63,7 @@ void check_product(int64_t nodes, int64_t each, std::mt19937& random, const std:
   for (int64_t i = 0; i < force.size; ++i) {
     const int64_t m = i / size;
     force[i] = normal(random), weight[i] = 1 + std::abs(normal(random));
-    if (!active[m * blocks + i % size / kTogether]) continue;
+    if (!active[m * blocks + i % size / kChunk]) continue;
     v[i] = normal(random), free[i] = random() % 3 > 0;
     const double held = mass[m * nodes + i % size / each] * v[i], pushed = double(factor[m]) * force[i];
     const double of_a = free[i] ? held + pushed : double(v[i]);
@@ -90,23 +89,23 @@ void check_product(int64_t nodes, int64_t each, std::mt19937& random, const std:
 template <class T>
 void check_matrices(int64_t particles, std::mt19937& random, const std::vector<const Pool*>& pools) {
   const int64_t batch = 2, n = particles;
-  const Array<T> given(batch * 9 * n), values(batch * 3 * n), vectors(given.size), rotations(given.size);
+  const Array<T> matrices(batch * 9 * n), values(batch * 3 * n), vectors(matrices.size), rotations(matrices.size);
   std::normal_distribution<T> normal;
   for (int64_t m = 0; m < batch; ++m) {
     for (int64_t k = 0; k < n; ++k) {
       const T size = k % 7 == 6 ? 0 : std::pow(T(10), T(3 * (k % 7 - 3)));
       for (int i = 0; i < 9; ++i) {
         const T repeated = i % 4 == 0 ? 1 : 0;
-        given[(9 * m + i) * n + k] = size * (k % 3 == 0 ? repeated : normal(random));
+        matrices[(9 * m + i) * n + k] = size * (k % 3 == 0 ? repeated : normal(random));
       }
-      if (k % 11 == 10) given[9 * m * n + k] = std::numeric_limits<T>::quiet_NaN();
+      if (k % 11 == 10) matrices[9 * m * n + k] = std::numeric_limits<T>::quiet_NaN();
     }
   }
   const Shape shape = {3, 0, batch, n, 0, 0};
   std::unique_ptr<Array<T>> bits_w, bits_V, bits_R;
   for (const Pool* pool : pools) {
-    eigen(*pool, batch, Eigen<T>{given.data.get(), values.data.get(), vectors.data.get(), n});
-    rotation(*pool, batch, Rotation<T>{given.data.get(), rotations.data.get(), n});
+    eigen(*pool, batch, Eigen<T>{matrices.data.get(), values.data.get(), vectors.data.get(), n});
+    rotation(*pool, batch, Rotation<T>{matrices.data.get(), rotations.data.get(), n});
     if (bits_w == nullptr) {
       bits_w = std::make_unique<Array<T>>(values);
       bits_V = std::make_unique<Array<T>>(vectors);
@@ -117,13 +116,13 @@ void check_matrices(int64_t particles, std::mt19937& random, const std::vector<c
     expect_same("rotations", *bits_R, rotations);
   }
   // Of what is found: V diag(w) Vᵀ, VᵀV, RᵀR, and RᵀF beside its transpose.
-  const Array<T> product(given.size), squares(2 * given.size), stretch(given.size);
-  std::vector<double> A(given.size), one(squares.size), transposed(given.size), scale(given.size), ones(squares.size, 1);
+  const Array<T> product(matrices.size), squares(2 * matrices.size), stretch(matrices.size);
+  std::vector<double> A(matrices.size), one(squares.size), transposed(A.size()), scale(A.size()), ones(one.size(), 1);
   for (int64_t m = 0; m < batch; ++m) {
     for (int64_t k = 0; k < n; ++k) {
       const auto at = [&](int i, int j) { return (9 * m + 3 * i + j) * n + k; };
       double size = 0;
-      for (int i = 0; i < 9; ++i) size += std::abs(given[at(0, i)]);
+      for (int i = 0; i < 9; ++i) size += std::abs(matrices[at(0, i)]);
       for (int i = 0; i < 3; ++i) {
         for (int j = 0; j < 3; ++j) {
           double a = 0, v = 0, r = 0, s = 0, t = 0;
@@ -131,12 +130,12 @@ void check_matrices(int64_t particles, std::mt19937& random, const std::vector<c
             a += double(vectors[at(i, l)]) * values[(3 * m + l) * n + k] * vectors[at(j, l)];
             v += double(vectors[at(l, i)]) * vectors[at(l, j)];
             r += double(rotations[at(l, i)]) * rotations[at(l, j)];
-            s += double(rotations[at(l, i)]) * given[at(l, j)];
-            t += double(rotations[at(l, j)]) * given[at(l, i)];
+            s += double(rotations[at(l, i)]) * matrices[at(l, j)];
+            t += double(rotations[at(l, j)]) * matrices[at(l, i)];
           }
-          product[at(i, j)] = T(a), A[at(i, j)] = given[i < j ? at(i, j) : at(j, i)];
-          squares[at(i, j)] = T(v), squares[given.size + at(i, j)] = T(r);
-          one[at(i, j)] = one[given.size + at(i, j)] = std::isfinite(size) ? i == j : size;
+          product[at(i, j)] = T(a), A[at(i, j)] = matrices[i < j ? at(i, j) : at(j, i)];
+          squares[at(i, j)] = T(v), squares[matrices.size + at(i, j)] = T(r);
+          one[at(i, j)] = one[matrices.size + at(i, j)] = std::isfinite(size) ? i == j : size;
           stretch[at(i, j)] = T(s), transposed[at(i, j)] = t;
           if (!std::isfinite(size)) A[at(i, j)] = size, squares[at(i, j)] = T(size);  // V may be the identity
           scale[at(i, j)] = size;
@@ -178,9 +177,9 @@ int check_order(const std::vector<const Pool*>& pools) {
         std::stable_sort(first, last, [&](int32_t a, int32_t b) { return keys[m * count + a] < keys[m * count + b]; });
       }
       for (const Pool* pool : pools) {
-        const Array<int32_t> found(keys.size);
-        order(*pool, batch, Order{keys.data.get(), found.data.get(), count});
-        expect_same("an order", expected, found);
+        const Array<int32_t> result(keys.size);
+        order(*pool, batch, Order{keys.data.get(), result.data.get(), count});
+        expect_same("an order", expected, result);
       }
       ++examples;
     }
@@ -228,53 +227,11 @@ int check_rearrangement(const std::vector<const Pool*>& pools) {
   return examples;
 }
 
-// Slopes by the sums of an average, over memory of any content; most nodes are empty, and say nothing whatever is there.
-template <class T>
-int check_slope(const std::vector<const Pool*>& pools) {
-  std::mt19937 random(4);
-  std::normal_distribution<T> normal;
-  int examples = 0;
-  for (const int64_t n : {0, 1, 700, 300000}) {
-    for (const int64_t others : {1, 2, 3, 5}) {
-      const int64_t batch = 2, c = others + 1;
-      const Array<T> whole(batch * n), means(whole.size * others), by_means(means.size), by_whole(whole.size);
-      const Array<T> found(whole.size * c);
-      std::vector<double> expected(found.size), scale(found.size, 1);
-      for (int64_t i = 0; i < whole.size; ++i) {
-        by_whole[i] = normal(random);
-        if (i % 500 < 100 && i % 3 > 0) whole[i] = 1 + std::abs(normal(random));
-        if (whole[i] == 0) by_whole[i] = std::numeric_limits<T>::quiet_NaN();
-        expected[i * c + others] = whole[i] == 0 ? 0 : by_whole[i];
-        for (int64_t k = 0; k < others; ++k) {
-          const int64_t at = i * others + k;
-          means[at] = normal(random), by_means[at] = normal(random);
-          expected[i * c + k] = whole[i] == 0 ? 0 : by_means[at] / double(whole[i]);
-          expected[i * c + others] -= expected[i * c + k] * means[at];
-          scale[i * c + others] += std::abs(means[at] * by_means[at]);
-        }
-      }
-      for (const Pool* pool : pools) {
-        for (int64_t i = 0; i < found.size; ++i) found[i] = 7;
-        slope(*pool, batch, Slope<T>{whole.data.get(), means.data.get(), by_means.data.get(), by_whole.data.get(),
-                                     found.data.get(), n, c});
-        compare("slope", {1, 0, batch, 0, n, c}, found, expected, scale);
-        // The same without slopes by the weights.
-        slope(*pool, batch, Slope<T>{whole.data.get(), means.data.get(), by_means.data.get(), nullptr, found.data.get(), n, c});
-        for (int64_t i = 0; i < whole.size; ++i) found[i * c + others] += whole[i] == 0 ? 0 : by_whole[i];
-        compare("slope by means", {1, 0, batch, 0, n, c}, found, expected, scale);
-      }
-      ++examples;
-    }
-  }
-  return examples;
-}
-
 }  // namespace
 
 int check_arrays(const std::vector<const Pool*>& pools) {
-  return check_all<float>(pools) + check_all<double>(pools) + check_order(pools) +
-         check_rearrangement<float>(pools) + check_rearrangement<double>(pools) + check_slope<float>(pools) +
-         check_slope<double>(pools);
+  return check_all<float>(pools) + check_all<double>(pools) + check_order(pools) + check_rearrangement<float>(pools) +
+         check_rearrangement<double>(pools);
 }
 
 }  // namespace mpmjax

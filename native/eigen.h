@@ -5,7 +5,7 @@
 
 #include <limits>
 
-#include "abreast.h"
+#include "simd.h"
 #include "matrices.h"
 
 namespace {
@@ -35,9 +35,9 @@ MPMJAX_INLINE void rotate(Matrix<V>& A, Matrix<V>& vectors, V negligible) {
 
 template <class T>
 void eigen(const mpmjax::Eigen<T>& task, int64_t first, int64_t last) {
-  using V = Abreast<T>;
+  using V = Simd<T>;
   const V one = V() + 1, negligible = V() + std::numeric_limits<T>::epsilon() / 8;
-  for (int64_t k = first; k < last; k += kAbreast<T>) {
+  for (int64_t k = first; k < last; k += kSimdLanes<T>) {
     const Place<T> place(k, last, task.particles);
     Matrix<V> A, vectors;
     V size = {};  // the largest magnitude, of which squares could overflow

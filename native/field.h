@@ -11,7 +11,7 @@
 namespace {
 
 template <class T, int s, int c>
-MPMJAX_INLINE Field<T, s, c> product(Abreast<T> a, const Field<T, s, c>& x) {
+MPMJAX_INLINE Field<T, s, c> product(Simd<T> a, const Field<T, s, c>& x) {
   return Field<T, s, c>::of([&](int k) MPMJAX_INLINE_LAMBDA { return a * x.at[k]; });
 }
 
@@ -22,8 +22,8 @@ MPMJAX_INLINE Field<T, s, c> operator+(const Field<T, s, c>& a, const Field<T, s
 
 // The sum of the products of all numbers.
 template <class T, int s, int c>
-MPMJAX_INLINE Abreast<T> dot(const Field<T, s, c>& a, const Field<T, s, c>& b) {
-  Abreast<T> total = a.at[0] * b.at[0];
+MPMJAX_INLINE Simd<T> dot(const Field<T, s, c>& a, const Field<T, s, c>& b) {
+  Simd<T> total = a.at[0] * b.at[0];
 #pragma GCC unroll 16
   for (int k = 1; k < s * c; ++k) total += a.at[k] * b.at[k];
   return total;
@@ -31,12 +31,12 @@ MPMJAX_INLINE Abreast<T> dot(const Field<T, s, c>& a, const Field<T, s, c>& b) {
 
 // Whether the nodes of all particles of a block can be read as fields.
 template <class T, int d, int s, int columns>
-MPMJAX_INLINE bool has_fields(const Block<T, d, s, false>& block, int64_t size) {
-  if constexpr (columns == 0 || kAbreast<T> < kLanes) return false;
+MPMJAX_INLINE bool has_fields(const Block<T, d, s>& block, int64_t size) {
+  if constexpr (columns == 0 || kSimdLanes<T> < kLanes) return false;
   const int64_t most = (size * columns - Field<T, s, columns>::reach) / columns + s - 1;
   bool all = size * columns >= Field<T, s, columns>::reach;
   for (int q = 0; q < kBlock; ++q) {
-    all &= block.straight[q] && block.least[q] >= 0 && block.most[q] < size && block.most[q] <= most;
+    all &= block.contiguous[q] && block.least[q] >= 0 && block.most[q] < size && block.most[q] <= most;
   }
   return all;
 }
@@ -44,7 +44,7 @@ MPMJAX_INLINE bool has_fields(const Block<T, d, s, false>& block, int64_t size) 
 // The gathered value and gradients of all columns of some particles, one in each lane.
 template <class T, int d, int columns>
 struct Gathered {
-  using V = Abreast<T>;
+  using V = Simd<T>;
   V value[columns] = {}, gradients[d][columns] = {};
 
   // Adds what one node along axis a has, times its factors: its value, and its gradients along the axes after it.
@@ -63,24 +63,23 @@ struct Gathered {
 // The fields that some particles of a block read, from the q-th on, and the sums over them.
 template <class T, int d, int s, int columns>
 struct Fields {
-  using V = Abreast<T>;
+  using V = Simd<T>;
   using F = Field<T, s, columns>;
-  static constexpr int last = d - 1, rows = power(s, last), lanes = kAbreast<T>;
+  static constexpr int last = d - 1, rows = power(s, last), lanes = kSimdLanes<T>;
 
-  const Block<T, d, s, false>& block;
+  const Block<T, d, s>& block;
   int q;
   const T* from;
-  V weights[d][s], derivatives[d][s];
+  V weights[d][s], slopes[d][s];
   Runs<T, d, s, columns> runs;
   bool joined = false;  // whether rows are read by runs
   F nodes[rows];        // in C order of the axes before the last; none before `read_all` if rows are read by runs
 
-  MPMJAX_INLINE Fields(const Block<T, d, s, false>& block, int q, const T* from, int64_t size)
+  MPMJAX_INLINE Fields(const Block<T, d, s>& block, int q, const T* from, int64_t size)
       : block(block), q(q), from(from) {
     for (int a = 0; a < d; ++a) {
       for (int i = 0; i < s; ++i) {
-        std::memcpy(&weights[a][i], block.weights[a][i] + q, sizeof(V));
-        std::memcpy(&derivatives[a][i], block.derivatives[a][i] + q, sizeof(V));
+        weights[a][i] = at(block.weights[a][i]), slopes[a][i] = at(block.slopes[a][i]);
       }
     }
     if constexpr (kPermutes<T>) joined = runs.find(block, q, size);
@@ -89,7 +88,9 @@ struct Fields {
 
   // Reads all rows, for sums that need them more than once.
   MPMJAX_INLINE void read_all() {
-    for (int row = 0; row < rows && joined; ++row) nodes[row] = runs.row(block, q, from, row);
+    if constexpr (kPermutes<T>) {
+      for (int row = 0; row < rows && joined; ++row) nodes[row] = runs.row(block, q, from, row);
+    }
   }
 
   // The same without runs.
@@ -122,32 +123,33 @@ struct Fields {
     F gradients[last - a == 0 ? 1 : last - a];
   };
 
-  V by_weights[d][s], by_derivatives[d][s];  // of a pull
+  V by_weights[d][s], by_slopes[d][s];  // of a pull
 
   // Returns the sums over the axes from a on but the last, from the nodes of a first row on, and adds the derivatives by
-  // these axes' factors.
+  // the offsets along these axes.
   template <int a>
-  MPMJAX_INLINE Sums<a> sums(const F* from, const F& value, const F* gradients) {
+  MPMJAX_INLINE Sums<a> sums(const F* from, const F& value, const F* gradients, const Block<T, d, s>& derivatives,
+                             V* by_offset) const {
     Sums<a> total = {};
     if constexpr (a == last) {
       total.value = *from;
     } else {
       for (int i = 0; i < s; ++i) {
-        const V w = weights[a][i], g = derivatives[a][i];
+        const V w = weights[a][i], g = slopes[a][i];
         F narrow, inner[d];
         if constexpr (a + 1 < last) {
           narrow = product(w, value) + product(g, gradients[0]);
           for (int b = 1; b < last - a; ++b) inner[b - 1] = product(w, gradients[b]);
         }
-        const auto found = sums<a + 1>(from + i * power(s, last - a - 1), narrow, inner);
-        V by_weight = dot(value, found.value);
-        for (int b = 1; b < last - a; ++b) by_weight += dot(gradients[b], found.gradients[b - 1]);
-        by_weights[a][i] += by_weight;
-        by_derivatives[a][i] += dot(gradients[0], found.value);
-        total.value = total.value + product(w, found.value);
-        total.gradients[0] = total.gradients[0] + product(g, found.value);
+        const auto result = sums<a + 1>(from + i * power(s, last - a - 1), narrow, inner, derivatives, by_offset);
+        V by_weight = dot(value, result.value);
+        for (int b = 1; b < last - a; ++b) by_weight += dot(gradients[b], result.gradients[b - 1]);
+        by_offset[a] += at(derivatives.weights[a][i]) * by_weight +
+                        at(derivatives.slopes[a][i]) * dot(gradients[0], result.value);
+        total.value = total.value + product(w, result.value);
+        total.gradients[0] = total.gradients[0] + product(g, result.value);
         for (int b = 1; b < last - a; ++b) {
-          total.gradients[b] = total.gradients[b] + product(w, found.gradients[b - 1]);
+          total.gradients[b] = total.gradients[b] + product(w, result.gradients[b - 1]);
         }
       }
     }
@@ -162,13 +164,13 @@ struct Fields {
   }
 
   // Writes the gathered value and gradients of all columns, as columns of (c, p) and (d, c, p).
-  MPMJAX_INLINE void write_sums(const Sums<0>& found, int64_t particles, T* value, T* gradients) const {
+  MPMJAX_INLINE void write_sums(const Sums<0>& result, int64_t particles, T* value, T* gradients) const {
     for (int c = 0; c < columns; ++c) {
-      put(along(weights[last], found.value, c), value + c * particles);
+      put(along(weights[last], result.value, c), value + c * particles);
       for (int b = 0; b < last; ++b) {
-        put(along(weights[last], found.gradients[b], c), gradients + (b * columns + c) * particles);
+        put(along(weights[last], result.gradients[b], c), gradients + (b * columns + c) * particles);
       }
-      put(along(derivatives[last], found.value, c), gradients + (last * columns + c) * particles);
+      put(along(slopes[last], result.value, c), gradients + (last * columns + c) * particles);
     }
   }
 
@@ -179,10 +181,10 @@ struct Fields {
     if constexpr (a == last) {
       const F field = row(first);
       for (int c = 0; c < columns; ++c) total.value[c] = along(weights[last], field, c);
-      for (int c = 0; c < columns; ++c) total.gradients[last][c] = along(derivatives[last], field, c);
+      for (int c = 0; c < columns; ++c) total.gradients[last][c] = along(slopes[last], field, c);
     } else {
       each<s, (a + 1 >= last)>([&](int i) MPMJAX_INLINE_LAMBDA {
-        total.template add<a>(weights[a][i], derivatives[a][i], gathered<a + 1>(s * first + i, row));
+        total.template add<a>(weights[a][i], slopes[a][i], gathered<a + 1>(s * first + i, row));
       });
     }
     return total;
@@ -198,28 +200,42 @@ struct Fields {
     return gathered<0>(0, [&](int i) MPMJAX_INLINE_LAMBDA { return nodes[i]; });
   }
 
-  // The same, and the derivatives by all factors, of all columns of the value and the gradients that are given.
-  MPMJAX_INLINE Sums<0> pull(const V (*given)[columns]) {
-    const V *w = weights[last], *g = derivatives[last];
+  // The sums of a gather, and the derivatives by the offsets, of all columns of the value and the gradients that are given.
+  MPMJAX_INLINE Sums<0> pull(const V (*values)[columns], const Block<T, d, s>& derivatives, V* by_offset) const {
+    const V *w = weights[last], *g = slopes[last];
     const auto spread = [&](const V* of, const V* factors) MPMJAX_INLINE_LAMBDA {
       return F::of([&](int k) MPMJAX_INLINE_LAMBDA { return factors[k / columns] * of[k % columns]; });
     };
     F gradients[d];
-    for (int b = 0; b < last; ++b) gradients[b] = spread(given[b + 1], w);
-    std::memset(by_weights, 0, sizeof by_weights);
-    std::memset(by_derivatives, 0, sizeof by_derivatives);
-    const auto found = sums<0>(nodes, spread(given[0], w) + spread(given[d], g), gradients);
+    for (int b = 0; b < last; ++b) gradients[b] = spread(values[b + 1], w);
+    for (int a = 0; a < d; ++a) by_offset[a] = V{};
+    const auto result = sums<0>(nodes, spread(values[0], w) + spread(values[d], g), gradients, derivatives, by_offset);
     for (int j = 0; j < s; ++j) {
+      V by_weight = {}, by_slope = {};
       for (int c = 0; c < columns; ++c) {
-        by_weights[last][j] += given[0][c] * found.value.at[j * columns + c];
-        by_derivatives[last][j] += given[d][c] * found.value.at[j * columns + c];
-        for (int b = 0; b < last; ++b) by_weights[last][j] += given[b + 1][c] * found.gradients[b].at[j * columns + c];
+        by_weight += values[0][c] * result.value.at[j * columns + c];
+        by_slope += values[d][c] * result.value.at[j * columns + c];
+        for (int b = 0; b < last; ++b) by_weight += values[b + 1][c] * result.gradients[b].at[j * columns + c];
       }
+      by_offset[last] += at(derivatives.weights[last][j]) * by_weight + at(derivatives.slopes[last][j]) * by_slope;
     }
-    return found;
+    return result;
   }
 
-  static MPMJAX_INLINE void put(V v, T* to) { std::memcpy(to, &v, sizeof v); }
+  // The numbers of these particles among those of a block.
+  MPMJAX_INLINE V at(const T* numbers) const {
+    V v;
+    std::memcpy(&v, numbers + q, sizeof v);
+    return v;
+  }
+
+  // Stores numbers, or adds them to what is there.
+  static MPMJAX_INLINE void put(V v, T* to, bool add = false) {
+    V before = {};
+    if (add) std::memcpy(&before, to, sizeof v);
+    v = add ? v + before : v;
+    std::memcpy(to, &v, sizeof v);
+  }
 };
 
 }  // namespace

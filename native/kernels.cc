@@ -1,72 +1,61 @@
-// The sums for every dimension and kernel, and the passes over arrays, compiled once for each instruction set:
-// MPMJAX_TARGET is its name.
+// All kernels for one instruction set, MPMJAX_TARGET, and one type of numbers, MPMJAX_NUMBER: each pair is compiled by
+// itself, at the same time as others and in a part of the memory. Without a type, both.
 
 #include "average.h"
 #include "eigen.h"
 #include "gather.h"
+#include "instructions.h"
 #include "passes.h"
 #include "pull.h"
 #include "resist.h"
 #include "rotation.h"
-#include "targets.h"
 
 namespace {
 
 using mpmjax::Kernels;
 
 template <class T, int d, int s>
-const Kernels<T>* of(bool differential) {
-  static constexpr Kernels<T> sums = {gather<T, d, s, false>, scatter<T, d, s, false>, average<T, d, s>,
-                                      find_ranges<T, d, s>,   pull<T, d, s>,           resist<T, d, s>,
-                                      resist_particles<T, d, s>};
-  static constexpr Kernels<T> differentials = {gather<T, d, s, true>, scatter<T, d, s, true>, nullptr, find_ranges<T, d, s>,
-                                               nullptr,               nullptr,                nullptr};
-  return differential ? &differentials : &sums;
-}
+constexpr Kernels<T> sums_of = {gather<T, d, s>, scatter<T, d, s>, average<T, d, s>,         find_ranges<T, d, s>,
+                                pull<T, d, s>,   resist<T, d, s>,  resist_particles<T, d, s>};
 
 template <class T, int d>
-const Kernels<T>* of(int s, bool differential) {
+const Kernels<T>* sums(int s) {
   switch (s) {
-    case 2: return of<T, d, 2>(differential);
-    case 3: return of<T, d, 3>(differential);
-    case 4: return of<T, d, 4>(differential);
+    case 2: return &sums_of<T, d, 2>;
+    case 3: return &sums_of<T, d, 3>;
+    case 4: return &sums_of<T, d, 4>;
     default: return nullptr;
   }
 }
 
 template <class T>
-const Kernels<T>* of(int d, int s, bool differential) {
+const Kernels<T>* sums(int d, int s) {
   switch (d) {
-    case 1: return of<T, 1>(s, differential);
-    case 2: return of<T, 2>(s, differential);
-    case 3: return of<T, 3>(s, differential);
+    case 1: return sums<T, 1>(s);
+    case 2: return sums<T, 2>(s);
+    case 3: return sums<T, 3>(s);
     default: return nullptr;
   }
 }
 
 template <class T>
-const mpmjax::ArrayKernels<T>& arrays() {
-  static constexpr mpmjax::ArrayKernels<T> kernels = {eigen<T>, rotation<T>, combine<T>, product<T>};
-  return kernels;
-}
+constexpr mpmjax::KernelSet<T> all = {sums<T>, eigen<T>, rotation<T>, combine<T>, product<T>};
 
 }  // namespace
 
 namespace mpmjax {
 
-#define MPMJAX_JOINED(a, b) a##b
-#define MPMJAX_KERNELS(target) MPMJAX_JOINED(kernels_, target)
-#define MPMJAX_ARRAY_KERNELS(target) MPMJAX_JOINED(array_kernels_, target)
+#define MPMJAX_JOINED(a, b) a##_##b
+#define MPMJAX_NAME(target, number) MPMJAX_JOINED(target, number)
+#define MPMJAX_SET(number)                                           \
+  extern const KernelSet<number> MPMJAX_NAME(MPMJAX_TARGET, number); \
+  const KernelSet<number> MPMJAX_NAME(MPMJAX_TARGET, number) = all<number>;
 
-const Kernels<float>* MPMJAX_KERNELS(MPMJAX_TARGET)(float, int d, int s, bool differential) {
-  return of<float>(d, s, differential);
-}
-
-const Kernels<double>* MPMJAX_KERNELS(MPMJAX_TARGET)(double, int d, int s, bool differential) {
-  return of<double>(d, s, differential);
-}
-
-const ArrayKernels<float>& MPMJAX_ARRAY_KERNELS(MPMJAX_TARGET)(float) { return arrays<float>(); }
-const ArrayKernels<double>& MPMJAX_ARRAY_KERNELS(MPMJAX_TARGET)(double) { return arrays<double>(); }
+#if defined(MPMJAX_NUMBER)
+MPMJAX_SET(MPMJAX_NUMBER)
+#else
+MPMJAX_SET(float)
+MPMJAX_SET(double)
+#endif
 
 }  // namespace mpmjax

@@ -2,7 +2,7 @@
 
 #include <algorithm>
 
-#include "targets.h"
+#include "instructions.h"
 
 namespace mpmjax {
 namespace {
@@ -19,27 +19,27 @@ void over_particles(const Pool& pool, int64_t batch, int64_t particles, const Ru
   });
 }
 
-template <class T>
-void eigen_all(const Pool& pool, int64_t batch, const Eigen<T>& all) {
-  const int64_t n = all.particles;
-  over_particles(pool, batch, n, [&](int64_t m, int64_t first, int64_t last) {
-    array_kernels(T()).eigen({all.matrices + 9 * n * m, all.values + 3 * n * m, all.vectors + 9 * n * m, n}, first, last);
-  });
-}
-
-template <class T>
-void rotation_all(const Pool& pool, int64_t batch, const Rotation<T>& all) {
-  const int64_t n = all.particles;
-  over_particles(pool, batch, n, [&](int64_t m, int64_t first, int64_t last) {
-    array_kernels(T()).rotation({all.matrices + 9 * n * m, all.rotations + 9 * n * m, n}, first, last);
-  });
-}
-
 }  // namespace
 
-void eigen(const Pool& pool, int64_t batch, const Eigen<float>& first) { eigen_all(pool, batch, first); }
-void eigen(const Pool& pool, int64_t batch, const Eigen<double>& first) { eigen_all(pool, batch, first); }
-void rotation(const Pool& pool, int64_t batch, const Rotation<float>& first) { rotation_all(pool, batch, first); }
-void rotation(const Pool& pool, int64_t batch, const Rotation<double>& first) { rotation_all(pool, batch, first); }
+template <class T>
+void eigen(const Pool& pool, int64_t batch, const Eigen<T>& all) {
+  const int64_t n = all.particles;
+  over_particles(pool, batch, n, [&](int64_t m, int64_t first, int64_t last) {
+    kernels<T>().eigen({all.matrices + 9 * n * m, all.values + 3 * n * m, all.vectors + 9 * n * m, n}, first, last);
+  });
+}
+
+template <class T>
+void rotation(const Pool& pool, int64_t batch, const Rotation<T>& all) {
+  const int64_t n = all.particles;
+  over_particles(pool, batch, n, [&](int64_t m, int64_t first, int64_t last) {
+    kernels<T>().rotation({all.matrices + 9 * n * m, all.rotations + 9 * n * m, n}, first, last);
+  });
+}
+
+template void eigen(const Pool&, int64_t, const Eigen<float>&);
+template void eigen(const Pool&, int64_t, const Eigen<double>&);
+template void rotation(const Pool&, int64_t, const Rotation<float>&);
+template void rotation(const Pool&, int64_t, const Rotation<double>&);
 
 }  // namespace mpmjax

@@ -26,9 +26,9 @@ struct Rotation {
 };
 
 // `batch` problems follow each other in every array.
-void eigen(const Pool& pool, int64_t batch, const Eigen<float>& first);
-void eigen(const Pool& pool, int64_t batch, const Eigen<double>& first);
-void rotation(const Pool& pool, int64_t batch, const Rotation<float>& first);
-void rotation(const Pool& pool, int64_t batch, const Rotation<double>& first);
+template <class T>
+void eigen(const Pool& pool, int64_t batch, const Eigen<T>& first);
+template <class T>
+void rotation(const Pool& pool, int64_t batch, const Rotation<T>& first);
 
 }  // namespace mpmjax

@@ -23,9 +23,9 @@ void sort(const Order& all) {
     for (int64_t k = 0; k < all.count; ++k) ++places[digit(all.keys[k])];
     int64_t place = 0;
     for (int64_t& one : places) {
-      const int64_t found = one;
+      const int64_t result = one;
       one = place;
-      place += found;
+      place += result;
     }
     for (int64_t k = 0; k < all.count; ++k) {
       const int32_t number = all.order[k];
@@ -49,8 +49,10 @@ void rearrange_row(const Rearrangement<T>& all, const T* from, T* to) {
   }
 }
 
+}  // namespace
+
 template <class T>
-void rearrange_all(const Pool& pool, int64_t batch, const Rearrangement<T>& all) {
+void rearrange(const Pool& pool, int64_t batch, const Rearrangement<T>& all) {
   const int64_t size = all.rows * all.count;
   if (all.from == all.to && std::none_of(all.wanted, all.wanted + batch, [](bool one) { return one; })) return;
   share(pool, batch * all.rows, [&](int64_t i) {
@@ -67,10 +69,8 @@ void rearrange_all(const Pool& pool, int64_t batch, const Rearrangement<T>& all)
   });
 }
 
-}  // namespace
-
-void rearrange(const Pool& p, int64_t b, const Rearrangement<float>& first) { rearrange_all(p, b, first); }
-void rearrange(const Pool& p, int64_t b, const Rearrangement<double>& first) { rearrange_all(p, b, first); }
+template void rearrange(const Pool&, int64_t, const Rearrangement<float>&);
+template void rearrange(const Pool&, int64_t, const Rearrangement<double>&);
 
 void order(const Pool& pool, int64_t batch, const Order& first) {
   share(pool, batch, [&](int64_t m) { sort({first.keys + m * first.count, first.order + m * first.count, first.count}); });

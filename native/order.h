@@ -29,7 +29,7 @@ struct Rearrangement {
 
 // `batch` problems follow each other in every array.
 void order(const Pool& pool, int64_t batch, const Order& first);
-void rearrange(const Pool& pool, int64_t batch, const Rearrangement<float>& first);
-void rearrange(const Pool& pool, int64_t batch, const Rearrangement<double>& first);
+template <class T>
+void rearrange(const Pool& pool, int64_t batch, const Rearrangement<T>& first);
 
 }  // namespace mpmjax

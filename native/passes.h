@@ -10,7 +10,7 @@
 
 namespace {
 
-using mpmjax::kTogether;
+using mpmjax::kChunk;
 
 template <class T>
 void reset(T* result, const T* one, const T* other, int64_t first, int64_t count) {
@@ -21,13 +21,13 @@ void reset(T* result, const T* one, const T* other, int64_t first, int64_t count
 // another.
 class Sum {
  public:
-  // Calls term(i) for i from zero to count, at most kTogether.
+  // Calls term(i) for i from zero to count, at most kChunk.
   template <class Term>
   void add(int64_t count, const Term& term) {
-    double terms[kTogether] = {};
+    double terms[kChunk] = {};
     for (int64_t i = 0; i < count; ++i) terms[i] = term(i);
-    for (int64_t i = 0; i < kTogether; i += kBeside) {
-      for (int64_t k = 0; k < kBeside; ++k) sums_[k] += terms[i + k];
+    for (int64_t i = 0; i < kChunk; i += kPartialSums) {
+      for (int64_t k = 0; k < kPartialSums; ++k) sums_[k] += terms[i + k];
     }
   }
 
@@ -38,8 +38,8 @@ class Sum {
   }
 
  private:
-  static constexpr int64_t kBeside = 8;
-  double sums_[kBeside] = {};
+  static constexpr int64_t kPartialSums = 8;
+  double sums_[kPartialSums] = {};
 };
 
 template <class T>
@@ -47,13 +47,13 @@ double combine(const mpmjax::Combine<T>& task, int64_t first, int64_t last) {
   const T s = task.scales[0], t = task.scales[1];
   Sum sum;
   for (int64_t k = first; k < last; ++k) {
-    const int64_t start = k * kTogether, count = std::min(kTogether, task.size - start);
+    const int64_t start = k * kChunk, count = std::min(kChunk, task.size - start);
     if (!task.active[k]) {
       reset(task.y, task.a, task.b, start, count);
       reset(task.z, task.c, task.d, start, count);
       continue;
     }
-    T y[kTogether], z[kTogether];  // the results may lie where the vectors are
+    T y[kChunk], z[kChunk];  // the results may lie where the vectors are
     for (int64_t i = 0; i < count; ++i) y[i] = task.a[start + i] + s * task.b[start + i];
     for (int64_t i = 0; i < count; ++i) z[i] = task.c[start + i] + t * task.d[start + i];
     sum.add(count, [&](int64_t i) { return static_cast<double>(task.weight[start + i] * z[i]) * z[i]; });
@@ -69,12 +69,12 @@ double product(const mpmjax::Product<T>& task, int64_t first, int64_t last) {
   const int64_t each = task.nodes > 0 ? task.size / task.nodes : 1;
   Sum sum;
   for (int64_t k = first; k < last; ++k) {
-    const int64_t start = k * kTogether, count = std::min(kTogether, task.size - start);
+    const int64_t start = k * kChunk, count = std::min(kChunk, task.size - start);
     if (!task.active[k]) {
       if (task.whole) std::memset(task.image + start, 0, static_cast<size_t>(count) * sizeof(T));
       continue;
     }
-    T mass[kTogether], image[kTogether];  // the image may lie where the force is
+    T mass[kChunk], image[kChunk];  // the image may lie where the force is
     for (int64_t i = 0, node = start / each, part = start % each; i < count; ++i) {
       mass[i] = task.mass[node];
       if (++part == each) part = 0, ++node;

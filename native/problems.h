@@ -6,12 +6,11 @@
 //   scatter  f_i  = Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b)
 //   gather   a_p  = Σ_i w_ip f_i,   a_p,b = Σ_i g_ip,b f_i
 //   average  m_i, the last column of a scatter, and the others divided by it
-//   pull     ∂B/∂factors,   B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b)
+//   pull     ∂B/∂t,   B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b)
 //   resist   the scatter of K_p times the gather's gradients, with a symmetric matrix K_p for each particle
 //
-// Weights are products of one factor along each axis; of a gradient's factors the one along its direction is a
-// derivative. Only the factors are given, (d, s, p) with s nodes along an axis, or the particles' places, of which the
-// factors are polynomials.
+// Weights are products of one polynomial along each axis, of the particle's offset t; of a gradient's the one along its
+// direction is a slope. First nodes and offsets are given, (d, p) each, and the polynomials.
 
 #pragma once
 
@@ -20,32 +19,30 @@
 namespace mpmjax {
 
 constexpr int kMostAxes = 3;
-constexpr int kBlock = 16;  // particles that are handled together
-constexpr int64_t kTogether = 64;  // numbers of the nodes that are passed over together
-constexpr int64_t kCached = 1 << 21;  // bytes of an array that a cache may hold from one pass to the next
+constexpr int kMostNodes = 4;                   // along an axis
+constexpr int kMostTerms = 2 * kMostNodes + 1;  // of the squares of a gradient's polynomials
+constexpr int kBlock = 16;                      // particles that are handled together
+constexpr int64_t kChunk = 64;                  // numbers of the nodes that are passed over together
+constexpr int64_t kCached = 1 << 21;            // bytes of an array that a cache may hold from one pass to the next
 
-// Where particles are, from which their factors are found: the i-th node along an axis has the index term
-// (first + i) stride, and Σ_k c_k (t − τ)^k for a weight and for a derivative.
+// How nodes are numbered, and the polynomials. The i-th node along an axis, from a particle's first one on, has
+// Σ_k c_ik (t − τ_i)^k.
 template <class T>
-struct Places {
-  const int32_t* first;    // (d, p)
-  const int32_t* strides;  // (d)
-  const T* offset;         // t, (d, p)
-  const T* polynomials;    // τ and then the c, (2, s, s + 2): of the weights, and of the derivatives
+struct Basis {
+  int32_t shape[kMostAxes], strides[kMostAxes];
+  bool periodic[kMostAxes];  // whether after an axis' last node come its first ones
+  int terms;                 // of each polynomial
+  T knots[kMostNodes];       // τ
+  T weights[kMostNodes][kMostTerms], slopes[kMostNodes][kMostTerms];  // c
 };
 
 template <class T>
 struct Stencils {
-  // Terms of the flat node index. They wrap as 32-bit integers do: those of a particle outside of the window have no
-  // meaning, and may be any number.
-  const int32_t* index;
-  const T* weights;
-  const T* derivatives;
-  // The changes of both, for the differential of a sum by its factors; null for the sum itself.
-  const T* weight_changes;
-  const T* derivative_changes;
+  const int32_t* first;  // (d, p)
+  const T* offset;       // t, (d, p)
+  const T* change;       // dt, for the differential of a sum along it; null for the sum itself
   int64_t particles;
-  Places<T> places;  // where factors are not given: then those before are null
+  Basis<T> basis;
 };
 
 template <class T>
@@ -60,7 +57,7 @@ struct Gather {
 
 // What particles give in a scatter or a pull.
 template <class T>
-struct Given {
+struct ParticleValues {
   const T* value;      // a, (c, p), or null for zero
   const T* gradients;  // a_b, (d, k, p), zero in columns from k on; or null for zero
   int64_t graded;      // k
@@ -74,7 +71,7 @@ struct Range {
 template <class T>
 struct Scatter {
   Stencils<T> stencils;
-  Given<T> given;
+  ParticleValues<T> values;
   T* nodes;             // (n, c)
   const Range* ranges;  // of each block, or null
   bool* reached;        // false, for each of the ⌈n/64⌉ blocks of nodes; or null, where nodes are few
@@ -87,7 +84,7 @@ struct Scatter {
 template <class T>
 struct Average {
   Stencils<T> stencils;
-  Given<T> given;
+  ParticleValues<T> values;
   const T* least;
   T* whole;             // the last column, (n)
   T* means;             // the others divided by it, (n, c − 1)
@@ -102,9 +99,8 @@ template <class T>
 struct Pull {
   Stencils<T> stencils;
   const T* nodes;     // (n, c)
-  Given<T> given;
-  T* by_weights;      // (d, s, p)
-  T* by_derivatives;  // (d, s, p)
+  ParticleValues<T> values;
+  T* by_offset;       // (d, p)
   T* value;           // the gather of the nodes, as in a gather; null where it is not wanted
   T* gradients;
   int64_t size;
@@ -126,9 +122,10 @@ struct Resist {
   const bool* wanted;  // as in a scatter
 };
 
-// The sums for one dimension and kernel. Gather and pull take particles from a first to a last. Others take all
-// particles, and set the nodes from a first to a last; they pass over blocks whose range of indices says that they give
-// nothing to these. `resist_particles` stores what the particles from a first to a last give.
+// The sums for one dimension and kernel. Those of d and d + 1 columns, vectors at the nodes without and with a mass, have
+// code of their own; others are summed in four columns at a time. Gather and pull take particles from a first to a last.
+// Others take all particles, and set the nodes from a first to a last; they pass over blocks whose range of indices says
+// that they give nothing to these. `resist_particles` stores what the particles from a first to a last give.
 template <class T>
 struct Kernels {
   void (*gather)(const Gather<T>&, int64_t first, int64_t last);

@@ -3,7 +3,7 @@
 
 #pragma once
 
-#include "abreast.h"
+#include "simd.h"
 #include "matrices.h"
 
 namespace {
@@ -41,15 +41,15 @@ template <class V>
 MPMJAX_INLINE V largest_root(const Matrix<V>& F) {
   const V J = determinant(F), one = V() + 1;
   const V squares = total<V>([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { return cofactor(F, i, j) * cofactor(F, i, j); });
-  V found = V() + std::sqrt(static_cast<decltype(J[0] + 0)>(3));
+  V result = V() + std::sqrt(static_cast<decltype(J[0] + 0)>(3));
   for (int step = 0; step < kNewtonSteps; ++step) {
-    const V square = found * found - one, slope = 4 * found * square - 8 * J;
-    const V lower = found - (square * square - 8 * J * found - 4 * squares) / (slope == 0 ? one : slope);
-    const auto falls = lower < found;
+    const V square = result * result - one, slope = 4 * result * square - 8 * J;
+    const V lower = result - (square * square - 8 * J * result - 4 * squares) / (slope == 0 ? one : slope);
+    const auto falls = lower < result;
     if (!any(falls)) break;
-    found = falls ? lower : found;
+    result = falls ? lower : result;
   }
-  return found;
+  return result;
 }
 
 template <class V>
@@ -137,8 +137,8 @@ MPMJAX_INLINE void polish(Quaternion<V>& q, const Matrix<V>& F) {
 
 template <class T>
 void rotation(const mpmjax::Rotation<T>& task, int64_t first, int64_t last) {
-  using V = Abreast<T>;
-  for (int64_t k = first; k < last; k += kAbreast<T>) {
+  using V = Simd<T>;
+  for (int64_t k = first; k < last; k += kSimdLanes<T>) {
     const Place<T> place(k, last, task.particles);
     Matrix<V> F;
     components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { F.at[i][j] = place.load(task.matrices, 3 * i + j); });

@@ -34,8 +34,8 @@ struct Row {
 
   // The node that a lane of a part belongs to, or -1.
   static constexpr int node(int part, int lane) {
-    const int found = part * together + lane / columns;
-    return lane < together * columns && found < s ? found : -1;
+    const int result = part * together + lane / columns;
+    return lane < together * columns && result < s ? result : -1;
   }
 
   // Where the columns of a node are among the lanes of all parts.
@@ -73,7 +73,7 @@ MPMJAX_INLINE Row<T, s, c, t> operator+(Row<T, s, c, t> a, Row<T, s, c, t> b) {
 
 // A vector of chosen lanes of another; where the number of a lane is -1 it holds anything.
 template <class V, class From, int... lane>
-MPMJAX_INLINE V chosen(From from, std::integer_sequence<int, lane...>) {
+MPMJAX_INLINE V shuffled(From from, std::integer_sequence<int, lane...>) {
 #if defined(__clang__) || __GNUC__ >= 12
   return __builtin_shufflevector(from, from, lane...);
 #else
@@ -83,7 +83,7 @@ MPMJAX_INLINE V chosen(From from, std::integer_sequence<int, lane...>) {
 
 // Lanes chosen from two vectors, those of the second counted on.
 template <class V, class M, int... lane>
-MPMJAX_INLINE V chosen(V a, V b, M, std::integer_sequence<int, lane...>) {
+MPMJAX_INLINE V shuffled(V a, V b, M, std::integer_sequence<int, lane...>) {
 #if defined(__clang__) || __GNUC__ >= 12
   return __builtin_shufflevector(a, b, lane...);
 #else
@@ -127,14 +127,14 @@ template <class R, class T>
 MPMJAX_INLINE R by_node(const Vector<T>& first) {
   const auto four = read_four<R, T>(first);
   return row_of<R>([&](auto k) MPMJAX_INLINE_LAMBDA {
-    return chosen<typename R::Part>(four, nodes_of<R, decltype(k)::value>(Count<R::lanes>()));
+    return shuffled<typename R::Part>(four, nodes_of<R, decltype(k)::value>(Count<R::lanes>()));
   });
 }
 
 // A row that has the same columns at each node.
 template <class R, class T>
 MPMJAX_INLINE R at_each(const Vector<T>& first) {
-  const auto part = chosen<typename R::Part>(read_four<R, T>(first), columns_of<R>(Count<R::lanes>()));
+  const auto part = shuffled<typename R::Part>(read_four<R, T>(first), columns_of<R>(Count<R::lanes>()));
   return row_of<R>([&](int) MPMJAX_INLINE_LAMBDA { return part; });
 }
 
@@ -142,7 +142,7 @@ MPMJAX_INLINE R at_each(const Vector<T>& first) {
 template <int i, class R>
 MPMJAX_INLINE auto columns_at(const R& row) {
   constexpr int part = i / R::together, place = i % R::together;
-  return chosen<Vector<typename R::Number>>(row.parts[part], lanes_of<R, place>(Count<kLanes>()));
+  return shuffled<Vector<typename R::Number>>(row.parts[part], lanes_of<R, place>(Count<kLanes>()));
 }
 
 // The sum of these over the nodes.
@@ -155,10 +155,10 @@ MPMJAX_INLINE auto sum(const R& row) {
 
 // Which lanes belong to a node and to the first so many of its columns.
 template <class R>
-struct Present {
+struct LaneMask {
   typename R::Mask lanes[R::count];
 
-  explicit MPMJAX_INLINE Present(int used) {
+  explicit MPMJAX_INLINE LaneMask(int used) {
     for (int k = 0; k < R::count; ++k) {
       for (int lane = 0; lane < R::lanes; ++lane) {
         lanes[k][lane] = R::node(k, lane) >= 0 && lane % R::columns < used ? -1 : 0;

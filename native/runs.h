@@ -5,7 +5,7 @@
 
 #pragma once
 
-#include "abreast.h"
+#include "simd.h"
 #include "block.h"
 #if defined(__AVX2__)
 #include <immintrin.h>
@@ -16,21 +16,21 @@ namespace {
 // Whether a vector has an instruction that permutes its lanes, and lanes enough for the nodes of several particles.
 template <class T>
 #if defined(__AVX2__)
-constexpr bool kPermutes = kAbreast<T> >= 8;
+constexpr bool kPermutes = kSimdLanes<T> >= 8;
 #else
 constexpr bool kPermutes = false;
 #endif
 
 // The lanes of a vector that indices name.
 template <class T, class M>
-MPMJAX_INLINE Abreast<T> permuted(Abreast<T> v, M lanes) {
+MPMJAX_INLINE Simd<T> permuted(Simd<T> v, M lanes) {
 #if !defined(__clang__)
   return __builtin_shuffle(v, lanes);
 #elif defined(__AVX512F__)
-  if constexpr (sizeof(T) == 4) return (Abreast<T>)_mm512_permutexvar_ps((__m512i)lanes, (__m512)v);
-  if constexpr (sizeof(T) == 8) return (Abreast<T>)_mm512_permutexvar_pd((__m512i)lanes, (__m512d)v);
+  if constexpr (sizeof(T) == 4) return (Simd<T>)_mm512_permutexvar_ps((__m512i)lanes, (__m512)v);
+  if constexpr (sizeof(T) == 8) return (Simd<T>)_mm512_permutexvar_pd((__m512i)lanes, (__m512d)v);
 #elif defined(__AVX2__)
-  return (Abreast<T>)_mm256_permutevar8x32_ps((__m256)v, (__m256i)lanes);
+  return (Simd<T>)_mm256_permutevar8x32_ps((__m256)v, (__m256i)lanes);
 #endif
 }
 
@@ -55,12 +55,12 @@ constexpr auto taken_of(std::integer_sequence<int, lane...>) {
 
 // One column of as many nodes as there are lanes, which lie in these parts.
 template <class T, int columns, int c, int part = 1>
-MPMJAX_INLINE Abreast<T> column_of(const Abreast<T>* parts, Abreast<T> joined) {
+MPMJAX_INLINE Simd<T> column_of(const Simd<T>* parts, Simd<T> joined) {
   if constexpr (part == columns) {
     return joined;
   } else {
-    constexpr int lanes = kAbreast<T>;
-    const auto next = chosen(joined, parts[part], typename LanesOf<T, lanes>::type(),
+    constexpr int lanes = kSimdLanes<T>;
+    const auto next = shuffled(joined, parts[part], typename LanesOf<T, lanes>::type(),
                              taken_of<columns, c, part>(Count<lanes>()));
     return column_of<T, columns, c, part + 1>(parts, next);
   }
@@ -69,7 +69,7 @@ MPMJAX_INLINE Abreast<T> column_of(const Abreast<T>* parts, Abreast<T> joined) {
 // The nodes along the last axis, with all their columns.
 template <class T, int s, int columns>
 struct Field {
-  using V = Abreast<T>;
+  using V = Simd<T>;
   static constexpr int numbers = s * columns;
   static constexpr int reach = (numbers + kLanes - 1) / kLanes * kLanes;  // how many are read at once
   V at[numbers];
@@ -90,16 +90,16 @@ class Runs {
   // Finds the runs of the particles of a block from the q-th on, which all lie within the window. Rows are read from one
   // node before a run's first particle on. Returns false where runs are many, or so near an end of the window that a row
   // would reach beyond it.
-  MPMJAX_INLINE bool find(const Block<T, d, s, false>& block, int q, int64_t size) {
+  MPMJAX_INLINE bool find(const Block<T, d, s>& block, int q, int64_t size) {
     Index apart = {};  // not zero where the rows are not those of the particle before
     for (int a = 0; a < last; ++a) {
       for (int i = 0; i < s; ++i) {
-        const Index own = read(block.index[a][i] + q);
-        apart |= own ^ chosen<Index>(own, before_of(Count<lanes>()));
+        const Index index_terms = read(block.index[a][i] + q);
+        apart |= index_terms ^ shuffled<Index>(index_terms, before_of(Count<lanes>()));
       }
     }
     const int32_t* place = block.index[last][0] + q;
-    const Index own = read(place);
+    const Index index_terms = read(place);
     const int32_t end = static_cast<int32_t>(std::min<int64_t>(size, INT32_MAX)) - lanes + s;
     const uint32_t near = bits((read(block.least + q) < 1) | (read(block.most + q) > end));
     const uint32_t turns = bits(apart != 0);
@@ -108,7 +108,7 @@ class Runs {
     for (int first = 0; first < lanes && near == 0; ++count_) {
       if (count_ == kMost) return false;
       const int32_t least = place[first] - 1;
-      const Index from = own - least;
+      const Index from = index_terms - least;
       runs_[count_] = {first, least};
       place_[count_] = __builtin_convertvector(from, Lane);
       const uint32_t ends = (turns | bits((from < 0) | (from > lanes - s))) & (~uint32_t(1) << first);
@@ -118,12 +118,12 @@ class Runs {
   }
 
   // The nodes that the particles read in row i, in C order of the axes before the last.
-  MPMJAX_INLINE Field<T, s, columns> row(const Block<T, d, s, false>& block, int q, const T* nodes, int i) const {
+  MPMJAX_INLINE Field<T, s, columns> row(const Block<T, d, s>& block, int q, const T* nodes, int i) const {
     Field<T, s, columns> field;
-    read_run(block, q, nodes, i, 0, [&](int k, Abreast<T> v) MPMJAX_INLINE_LAMBDA { field.at[k] = v; });
+    read_run(block, q, nodes, i, 0, [&](int k, Simd<T> v) MPMJAX_INLINE_LAMBDA { field.at[k] = v; });
     for (int r = 1; r < count_; ++r) {
       const Lane meant = number_ >= runs_[r].first;
-      read_run(block, q, nodes, i, r, [&](int k, Abreast<T> v) MPMJAX_INLINE_LAMBDA {
+      read_run(block, q, nodes, i, r, [&](int k, Simd<T> v) MPMJAX_INLINE_LAMBDA {
         field.at[k] = meant ? v : field.at[k];
       });
     }
@@ -131,19 +131,19 @@ class Runs {
   }
 
  private:
-  static constexpr int lanes = kAbreast<T>, last = d - 1, kMost = 4;
+  static constexpr int lanes = kSimdLanes<T>, last = d - 1, kMost = 4;
   using Lane = typename LanesOf<T, lanes>::type;
   using Index = typename LanesOf<float, lanes>::type;
 
   // Calls put(k, number) for each number k of a row of the nodes that a run reads, in all lanes.
   template <class Put>
-  MPMJAX_INLINE void read_run(const Block<T, d, s, false>& block, int q, const T* nodes, int i, int r,
+  MPMJAX_INLINE void read_run(const Block<T, d, s>& block, int q, const T* nodes, int i, int r,
                               const Put& put) const {
     const Run& run = runs_[r];
     int64_t index = run.least;
     if constexpr (d == 2) index += block.index[0][i][q + run.first];
     if constexpr (d == 3) index += block.index[0][i / s][q + run.first] + block.index[1][i % s][q + run.first];
-    Abreast<T> parts[columns];
+    Simd<T> parts[columns];
 #pragma GCC unroll 4
     for (int m = 0; m < columns; ++m) std::memcpy(&parts[m], nodes + index * columns + m * lanes, sizeof parts[m]);
     each<columns, true>([&](auto c) MPMJAX_INLINE_LAMBDA {

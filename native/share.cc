@@ -11,7 +11,7 @@ namespace {
 
 // How often a thread looks whether the others are done before it sleeps, which takes some tens of microseconds at most. To
 // be woken may take as long, and shares are of about the same length.
-constexpr int kLooks = 1000;
+constexpr int kSpins = 1000;
 
 void pause() {
 #if defined(__x86_64__)
@@ -51,7 +51,7 @@ void share(const Pool& pool, int64_t count, const std::function<void(int64_t)>& 
   work->run = &run;
   for (int64_t i = 0; i < helpers; ++i) pool.schedule([work] { work->help(); });
   work->help();
-  for (int k = 0; k < kLooks; ++k) {
+  for (int k = 0; k < kSpins; ++k) {
     if (work->done.load() == count) return;
     pause();
   }

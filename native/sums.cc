@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "active.h"
-#include "targets.h"
+#include "instructions.h"
 
 namespace mpmjax {
 namespace {
@@ -29,7 +29,7 @@ int64_t shares(const Pool& pool, Form form, int64_t batch, int64_t particles, in
   return std::max<int64_t>(1, std::min(visits / kLeastVisits, most));
 }
 
-int64_t blocks_of(int64_t numbers) { return (numbers + kTogether - 1) / kTogether; }
+int64_t blocks_of(int64_t numbers) { return (numbers + kChunk - 1) / kChunk; }
 
 // The blocks of nodes that are wanted of the i-th member.
 const bool* member(const bool* wanted, int64_t i, int64_t numbers) {
@@ -37,7 +37,7 @@ const bool* member(const bool* wanted, int64_t i, int64_t numbers) {
 }
 
 template <class T>
-Given<T> member(Given<T> all, Form form, int64_t i, int64_t columns, int64_t particles) {
+ParticleValues<T> member(ParticleValues<T> all, Form form, int64_t i, int64_t columns, int64_t particles) {
   if (all.value != nullptr) all.value += i * columns * particles;
   if (all.gradients != nullptr) all.gradients += i * form.d * all.graded * particles;
   return all;
@@ -56,7 +56,7 @@ template <class T>
 Scatter<T> member(Scatter<T> all, Form form, int64_t i) {
   all.stencils = member(all.stencils, form, i);
   all.nodes += i * all.size * all.columns;
-  all.given = member(all.given, form, i, all.columns, all.stencils.particles);
+  all.values = member(all.values, form, i, all.columns, all.stencils.particles);
   all.wanted = member(all.wanted, i, all.size * all.columns);
   if (all.reached != nullptr) all.reached += i * blocks_of(all.size);
   return all;
@@ -65,7 +65,7 @@ Scatter<T> member(Scatter<T> all, Form form, int64_t i) {
 template <class T>
 Average<T> member(Average<T> all, Form form, int64_t i) {
   all.stencils = member(all.stencils, form, i);
-  all.given = member(all.given, form, i, all.columns, all.stencils.particles);
+  all.values = member(all.values, form, i, all.columns, all.stencils.particles);
   all.least += i;
   all.whole += i * all.size;
   all.means += i * all.size * (all.columns - 1);
@@ -76,16 +76,14 @@ Average<T> member(Average<T> all, Form form, int64_t i) {
 
 template <class T>
 Pull<T> member(Pull<T> all, Form form, int64_t i) {
-  const int64_t factors = i * form.d * form.s * all.stencils.particles;
   all.stencils = member(all.stencils, form, i);
   all.nodes += i * all.size * all.columns;
-  all.by_weights += factors;
-  all.by_derivatives += factors;
+  all.by_offset += i * form.d * all.stencils.particles;
   if (all.value != nullptr) {
     all.value += i * all.columns * all.stencils.particles;
     all.gradients += i * form.d * all.columns * all.stencils.particles;
   }
-  all.given = member(all.given, form, i, all.columns, all.stencils.particles);
+  all.values = member(all.values, form, i, all.columns, all.stencils.particles);
   return all;
 }
 
@@ -115,20 +113,16 @@ void over_particles(const Pool& pool, Form form, int64_t batch, const Problem& a
 // The flat index of a node in the middle of a particle's stencil.
 template <class T>
 int64_t middle_node(const Stencils<T>& stencils, Form form, int64_t particle) {
-  const int middle = form.s / 2;
   int64_t node = 0;
   for (int a = 0; a < form.d; ++a) {
-    if (const Places<T>& places = stencils.places; places.first != nullptr) {
-      node += (int64_t(places.first[a * stencils.particles + particle]) + middle) * places.strides[a];
-    } else {
-      node += stencils.index[(a * form.s + middle) * stencils.particles + particle];
-    }
+    const int64_t first = stencils.first[a * stencils.particles + particle];
+    node += (first + form.s / 2) * stencils.basis.strides[a];
   }
   return node;
 }
 
 // Where the nodes are cut into parts with about as many particles each, by a sample: the k-th part goes from the k-th
-// number to the next. None cuts a block of kTogether nodes. How well they are chosen changes seconds, never sums.
+// number to the next. None cuts a block of kChunk nodes. How well they are chosen changes seconds, never sums.
 template <class T>
 std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, Form form, int64_t parts) {
   const int64_t particles = stencils.particles, samples = std::min(kSamples, particles);
@@ -138,21 +132,21 @@ std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, Form form, i
     if (middle >= 0 && middle < size) places.push_back(middle);
   }
   std::sort(places.begin(), places.end());
-  std::vector<int64_t> found = {0};
+  std::vector<int64_t> result = {0};
   for (int64_t k = 1; k < parts; ++k) {
     const int64_t place = places.empty() ? 0 : places[k * places.size() / parts];
-    found.push_back(std::max(found.back(), place / kTogether * kTogether));
+    result.push_back(std::max(result.back(), place / kChunk * kChunk));
   }
-  found.push_back(size);
-  return found;
+  result.push_back(size);
+  return result;
 }
 
 // Calls run(problem, first, last) for the nodes of all members.
 template <class Problem, class Run>
 void over_nodes(const Pool& pool, Form form, int64_t batch, const Problem& all, const Division& by, const Run& run) {
   share(pool, batch * by.parts, [&](int64_t i) {
-    const std::vector<int64_t>& own = by.cuts[i / by.parts];
-    const int64_t first = own[i % by.parts], last = own[i % by.parts + 1];
+    const std::vector<int64_t>& cuts = by.cuts[i / by.parts];
+    const int64_t first = cuts[i % by.parts], last = cuts[i % by.parts + 1];
     Problem task = member(all, form, i / by.parts);
     task.ranges = by.ranges.empty() ? nullptr : by.ranges.data() + i / by.parts * by.blocks;
     if (first < last) run(task, first, last);
@@ -175,34 +169,18 @@ template <class T, class Problem>
 Division divide(const Pool& pool, Form form, int64_t batch, const Problem& all, const Kernels<T>& kernels,
                 bool wanted = false) {
   const int64_t particles = all.stencils.particles, blocks = (particles + kBlock - 1) / kBlock;
-  Division found = {shares(pool, form, batch, particles, all.columns, 1), blocks, {}, {}};
-  const int64_t parts = found.parts, each = (blocks + parts - 1) / parts;
-  found.cuts.assign(batch, {0, all.size});
-  if (parts == 1 && !wanted) return found;
-  found.ranges.resize(batch * blocks);
+  Division result = {shares(pool, form, batch, particles, all.columns, 1), blocks, {}, {}};
+  const int64_t parts = result.parts, each = (blocks + parts - 1) / parts;
+  result.cuts.assign(batch, {0, all.size});
+  if (parts == 1 && !wanted) return result;
+  result.ranges.resize(batch * blocks);
   share(pool, batch * parts, [&](int64_t i) {
     const int64_t k = i / parts, first = i % parts * each, last = std::min(blocks, first + each);
     const Stencils<T> stencils = member(all.stencils, form, k);
-    if (first < last) kernels.find_ranges(stencils, first, last, found.ranges.data() + k * blocks);
-    if (first == 0) found.cuts[k] = cut(stencils, all.size, form, parts);
+    if (first < last) kernels.find_ranges(stencils, first, last, result.ranges.data() + k * blocks);
+    if (first == 0) result.cuts[k] = cut(stencils, all.size, form, parts);
   });
-  return found;
-}
-
-template <class T>
-bool gather_all(const Pool& pool, Form form, int64_t batch, const Gather<T>& all) {
-  const Kernels<T>* found = kernels(T(), form.d, form.s, form.differential);
-  if (found == nullptr) return false;
-  over_particles(pool, form, batch, all, found->gather);
-  return true;
-}
-
-template <class T>
-bool pull_all(const Pool& pool, Form form, int64_t batch, const Pull<T>& all) {
-  const Kernels<T>* found = kernels(T(), form.d, form.s, false);
-  if (found == nullptr) return false;
-  over_particles(pool, form, batch, all, found->pull);
-  return true;
+  return result;
 }
 
 // Sets all nodes of a scatter or an average. Where they are too many for a cache, those that no particle reaches are told.
@@ -216,61 +194,59 @@ void set_nodes(const Pool& pool, Form form, int64_t batch, Problem all, const Ke
 }
 
 template <class T>
-bool scatter_all(const Pool& pool, Form form, int64_t batch, const Scatter<T>& all) {
-  const Kernels<T>* found = kernels(T(), form.d, form.s, form.differential);
-  if (found == nullptr) return false;
-  set_nodes(pool, form, batch, all, *found, found->scatter);
-  return true;
-}
-
-template <class T>
-bool average_all(const Pool& pool, Form form, int64_t batch, const Average<T>& all) {
-  const Kernels<T>* found = kernels(T(), form.d, form.s, false);
-  if (found == nullptr) return false;
-  set_nodes(pool, form, batch, all, *found, found->average);
-  return true;
-}
-
-template <class T>
-Division divided_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all) {
-  const Kernels<T>* found = kernels(T(), form.d, form.s, false);
-  return found == nullptr ? Division{} : divide(pool, form, batch, all, *found);
-}
-
-template <class T>
-bool resist_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all, const Division& division) {
-  const Kernels<T>* found = kernels(T(), form.d, form.s, false);
-  if (found == nullptr) return false;
-  if (reached(division) <= kMostReached) {
-    over_nodes(pool, form, batch, all, division, found->resist);
-    return true;
-  }
-  // Each particle once, and then a scatter: the parts would do most particles several times.
-  const std::unique_ptr<T[]> stored(new T[batch * form.d * all.columns * all.stencils.particles]);
-  Resist<T> first = all;
-  first.gradients = stored.get();
-  const Given<T> given = {nullptr, stored.get(), all.columns};
-  const Scatter<T> rest = {all.stencils, given, all.nodes, nullptr, nullptr, all.size, all.columns, all.wanted};
-  over_particles(pool, form, batch, first, found->resist_particles);
-  over_nodes(pool, form, batch, rest, division, found->scatter);
-  return true;
+const Kernels<T>& kernels_of(Form form) {
+  return *kernels<T>().sums(form.d, form.s);
 }
 
 }  // namespace
 
-bool gather(const Pool& p, Form f, int64_t b, const Gather<float>& g) { return gather_all(p, f, b, g); }
-bool gather(const Pool& p, Form f, int64_t b, const Gather<double>& g) { return gather_all(p, f, b, g); }
-bool scatter(const Pool& p, Form f, int64_t b, const Scatter<float>& s) { return scatter_all(p, f, b, s); }
-bool scatter(const Pool& p, Form f, int64_t b, const Scatter<double>& s) { return scatter_all(p, f, b, s); }
-bool average(const Pool& p, Form f, int64_t b, const Average<float>& a) { return average_all(p, f, b, a); }
-bool average(const Pool& p, Form f, int64_t b, const Average<double>& a) { return average_all(p, f, b, a); }
-bool pull(const Pool& p, Form f, int64_t b, const Pull<float>& q) { return pull_all(p, f, b, q); }
-bool pull(const Pool& p, Form f, int64_t b, const Pull<double>& q) { return pull_all(p, f, b, q); }
-bool resist(const Pool& p, Form f, int64_t b, const Resist<float>& r) { return resist_all(p, f, b, r, divided(p, f, b, r)); }
-bool resist(const Pool& p, Form f, int64_t b, const Resist<double>& r) { return resist_all(p, f, b, r, divided(p, f, b, r)); }
-Division divided(const Pool& p, Form f, int64_t b, const Resist<float>& r) { return divided_all(p, f, b, r); }
-Division divided(const Pool& p, Form f, int64_t b, const Resist<double>& r) { return divided_all(p, f, b, r); }
-bool resist(const Pool& p, Form f, int64_t b, const Resist<float>& r, const Division& d) { return resist_all(p, f, b, r, d); }
-bool resist(const Pool& p, Form f, int64_t b, const Resist<double>& r, const Division& d) { return resist_all(p, f, b, r, d); }
+template <class T>
+void gather(const Pool& pool, Form form, int64_t batch, const Gather<T>& all) {
+  over_particles(pool, form, batch, all, kernels_of<T>(form).gather);
+}
+
+template <class T>
+void pull(const Pool& pool, Form form, int64_t batch, const Pull<T>& all) {
+  over_particles(pool, form, batch, all, kernels_of<T>(form).pull);
+}
+
+template <class T>
+void scatter(const Pool& pool, Form form, int64_t batch, const Scatter<T>& all) {
+  set_nodes(pool, form, batch, all, kernels_of<T>(form), kernels_of<T>(form).scatter);
+}
+
+template <class T>
+void average(const Pool& pool, Form form, int64_t batch, const Average<T>& all) {
+  set_nodes(pool, form, batch, all, kernels_of<T>(form), kernels_of<T>(form).average);
+}
+
+template <class T>
+Division divided(const Pool& pool, Form form, int64_t batch, const Resist<T>& all) {
+  return divide(pool, form, batch, all, kernels_of<T>(form));
+}
+
+template <class T>
+void resist(const Pool& pool, Form form, int64_t batch, const Resist<T>& all, const Division& division) {
+  const Kernels<T>& kernels = kernels_of<T>(form);
+  if (reached(division) <= kMostReached) return over_nodes(pool, form, batch, all, division, kernels.resist);
+  // Each particle once, and then a scatter: the parts would do most particles several times.
+  const std::unique_ptr<T[]> stored(new T[batch * form.d * all.columns * all.stencils.particles]);
+  Resist<T> first = all;
+  first.gradients = stored.get();
+  const ParticleValues<T> values = {nullptr, stored.get(), all.columns};
+  const Scatter<T> rest = {all.stencils, values, all.nodes, nullptr, nullptr, all.size, all.columns, all.wanted};
+  over_particles(pool, form, batch, first, kernels.resist_particles);
+  over_nodes(pool, form, batch, rest, division, kernels.scatter);
+}
+
+#define MPMJAX_SUMS(T)                                                        \
+  template void gather(const Pool&, Form, int64_t, const Gather<T>&);         \
+  template void scatter(const Pool&, Form, int64_t, const Scatter<T>&);       \
+  template void average(const Pool&, Form, int64_t, const Average<T>&);       \
+  template void pull(const Pool&, Form, int64_t, const Pull<T>&);             \
+  template Division divided(const Pool&, Form, int64_t, const Resist<T>&);    \
+  template void resist(const Pool&, Form, int64_t, const Resist<T>&, const Division&);
+MPMJAX_SUMS(float)
+MPMJAX_SUMS(double)
 
 }  // namespace mpmjax

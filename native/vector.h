@@ -1,4 +1,4 @@
-// Four numbers at once, and numbers with a differential.
+// Four numbers at once.
 //
 // Rows of nodes and of particles are handled four columns at a time, in the vector extension that GCC and Clang share:
 // one source for SSE, AVX and NEON. Everything is in an anonymous namespace, because files that include this are
@@ -12,7 +12,7 @@
 
 #define MPMJAX_INLINE inline __attribute__((always_inline))
 #define MPMJAX_INLINE_LAMBDA __attribute__((always_inline))
-#define MPMJAX_APART __attribute__((noinline))  // once, not in each of its many uses
+#define MPMJAX_NOINLINE __attribute__((noinline))  // once, not in each of its many uses
 
 namespace {
 
@@ -98,39 +98,6 @@ MPMJAX_INLINE void each(const F& f) {
 #endif
     for (int i = 0; i < count; ++i) f(i);
   }
-}
-
-// x + ε dx with ε² = 0: arithmetic with such numbers gives differentials.
-template <class X>
-struct Dual {
-  X value;
-  X change;
-};
-
-template <class A, class X>
-MPMJAX_INLINE auto product(Dual<A> a, X x) {
-  return Dual<X>{product(a.value, x), product(a.change, x)};
-}
-
-template <class A, class X>
-MPMJAX_INLINE auto product(Dual<A> a, Dual<X> x) {
-  return Dual<X>{product(a.value, x.value), product(a.value, x.change) + product(a.change, x.value)};
-}
-
-template <class X>
-MPMJAX_INLINE Dual<X> operator+(Dual<X> a, Dual<X> b) {
-  return {a.value + b.value, a.change + b.change};
-}
-
-// What a sum returns: the number itself, or of a number with a differential the differential.
-template <class X>
-MPMJAX_INLINE X result(X x) {
-  return x;
-}
-
-template <class X>
-MPMJAX_INLINE X result(Dual<X> x) {
-  return x.change;
 }
 
 }  // namespace

@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <vector>
 
-#include "targets.h"
+#include "instructions.h"
 
 namespace mpmjax {
 namespace {
@@ -27,34 +27,34 @@ void over_blocks(const Pool& pool, int64_t batch, int64_t blocks, T* to, const R
   }
 }
 
+}  // namespace
+
 template <class T>
-void combine_all(const Pool& pool, int64_t batch, const Combine<T>& all) {
-  const int64_t blocks = (all.size + kTogether - 1) / kTogether;
+void combine(const Pool& pool, int64_t batch, const Combine<T>& all) {
+  const int64_t blocks = (all.size + kChunk - 1) / kChunk;
   over_blocks(pool, batch, blocks, all.sum, [&](int64_t m, int64_t first, int64_t last) {
     const int64_t by = m * all.size;
     const Combine<T> task = {all.a + by,      all.b + by,               all.c + by, all.d + by, all.scales + 2 * m,
                              all.weight + by, all.active + m * blocks, all.y + by, all.z + by, nullptr, all.size};
-    return array_kernels(T()).combine(task, first, last);
+    return kernels<T>().combine(task, first, last);
   });
 }
 
 template <class T>
-void product_all(const Pool& pool, int64_t batch, const Product<T>& all) {
-  const int64_t blocks = (all.size + kTogether - 1) / kTogether;
+void product(const Pool& pool, int64_t batch, const Product<T>& all) {
+  const int64_t blocks = (all.size + kChunk - 1) / kChunk;
   over_blocks(pool, batch, blocks, all.sum, [&](int64_t m, int64_t first, int64_t last) {
     const int64_t by = m * all.size;
     const Product<T> task = {all.force + by,  all.v + by,               all.mass + m * all.nodes, all.factor + m,
                              all.free + by,   all.weight + by,          all.active + m * blocks,  all.image + by,
                              nullptr,         all.size,                 all.nodes,                all.whole};
-    return array_kernels(T()).product(task, first, last);
+    return kernels<T>().product(task, first, last);
   });
 }
 
-}  // namespace
-
-void combine(const Pool& pool, int64_t batch, const Combine<float>& first) { combine_all(pool, batch, first); }
-void combine(const Pool& pool, int64_t batch, const Combine<double>& first) { combine_all(pool, batch, first); }
-void product(const Pool& pool, int64_t batch, const Product<float>& first) { product_all(pool, batch, first); }
-void product(const Pool& pool, int64_t batch, const Product<double>& first) { product_all(pool, batch, first); }
+template void combine(const Pool&, int64_t, const Combine<float>&);
+template void combine(const Pool&, int64_t, const Combine<double>&);
+template void product(const Pool&, int64_t, const Product<float>&);
+template void product(const Pool&, int64_t, const Product<double>&);
 
 }  // namespace mpmjax

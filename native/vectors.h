@@ -38,9 +38,9 @@ struct Product {
 };
 
 // `batch` problems follow each other in every array. The sums have the same bits for any number of threads.
-void combine(const Pool& pool, int64_t batch, const Combine<float>& first);
-void combine(const Pool& pool, int64_t batch, const Combine<double>& first);
-void product(const Pool& pool, int64_t batch, const Product<float>& first);
-void product(const Pool& pool, int64_t batch, const Product<double>& first);
+template <class T>
+void combine(const Pool& pool, int64_t batch, const Combine<T>& first);
+template <class T>
+void product(const Pool& pool, int64_t batch, const Product<T>& first);
 
 }  // namespace mpmjax

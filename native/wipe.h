@@ -14,7 +14,7 @@
 namespace {
 
 using mpmjax::kCached;
-using mpmjax::kTogether;
+using mpmjax::kChunk;
 
 // Numbers from a first to before a last become zero, or of these only the blocks that are wanted.
 template <class T>
@@ -24,16 +24,16 @@ void clear(T* numbers, const bool* wanted, int64_t first, int64_t last) {
     return;
   }
   for (int64_t end, i = first; i < last; i = end) {
-    end = (i / kTogether + 1) * kTogether;
+    end = (i / kChunk + 1) * kChunk;
     end = end < last ? end : last;
-    if (wanted[i / kTogether]) std::memset(numbers + i, 0, static_cast<size_t>(end - i) * sizeof(T));
+    if (wanted[i / kChunk]) std::memset(numbers + i, 0, static_cast<size_t>(end - i) * sizeof(T));
   }
 }
 
 // The same of numbers in an array that is too large for a cache, and which nobody reads soon: they are written past the
 // caches, which takes half as long. A cache would first read what is there.
 template <class T>
-MPMJAX_APART void stream(T* numbers, int64_t first, int64_t last) {
+MPMJAX_NOINLINE void stream(T* numbers, int64_t first, int64_t last) {
 #if defined(__SSE2__)
   constexpr int64_t kLine = 64, each = kLine / sizeof(T), quarter = each / 4;
   const int64_t into = static_cast<int64_t>(reinterpret_cast<uintptr_t>(numbers + first) % kLine / sizeof(T));

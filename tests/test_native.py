@@ -1,5 +1,9 @@
 """The native sums are those of XLA to rounding, whatever they are given, and one place chooses between them."""
 
+import os
+import platform
+import subprocess
+import sys
 import warnings
 from functools import partial
 from pathlib import Path
@@ -12,7 +16,7 @@ import pytest
 from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 
 import mpmjax as mpm
-from mpmjax.discretisation import Stencil, _fused_sums, _sums as sums, make_stencil
+from mpmjax.discretisation import Stencil, _fused_sums, _sums as sums, basis_attributes, make_stencil
 from mpmjax.discretisation._basis import basis_of
 from mpmjax.discretisation._sums import Group
 from mpmjax.implicit import ImplicitOperator, ParticleStiffness, Projection, _conjugate_residual as residuals
@@ -460,18 +464,23 @@ def test_a_particle_that_is_not_finite_spoils_its_own_nodes_alone(choose):
 
 
 @NEEDS_LIBRARY
-def test_wrong_arrays_are_refused():
-    """By the library itself: arrays whose shapes do not fit each other end in an error, not in a read beyond them."""
-    nodes = problem(2, 3, 3, 10, "float32")[-1]
-    index, w = jnp.zeros((2, 3, 10), "int32"), jnp.zeros((2, 3, 10), "float32")
+@pytest.mark.parametrize("what", ["an array", "an attribute", "coefficients"])
+def test_wrong_arrays_are_refused(what):
+    """By the library itself: what does not fit each other ends in an error, not in a read beyond it."""
+    first, t, _, nodes = problem(2, 3, 3, 10, "float32")
+    told = basis_attributes(basis_for(2, 3)) | {"differential": np.bool_(False)}
+    message = {"an array": "shapes do not fit", "an attribute": "is missing", "coefficients": "of both families"}[what]
+    match what:
+        case "an array":
+            t = t[:, :9]
+        case "an attribute":
+            told.pop("knots")
+        case "coefficients":
+            told["slopes"] = told["slopes"][:-1]
     bad = jax.ffi.ffi_call("mpmjax_gather", [jax.ShapeDtypeStruct((3, 10), "float32")] * 3)
     assert mpm.native.backend().name == "native"
-    with pytest.raises(Exception, match="shapes do not fit"):
-        jax.block_until_ready(
-            jax.jit(lambda *a: bad(*a, placed=np.bool_(False), differential=np.bool_(False)))(
-                index, w[..., :9], w, nodes
-            )
-        )
+    with pytest.raises(Exception, match=message):
+        jax.block_until_ready(jax.jit(lambda *a: bad(*a, **told))(first, t, nodes))
 
 
 @NEEDS_LIBRARY
@@ -543,6 +552,20 @@ def test_a_library_of_another_version_is_not_used(other_library, monkeypatch):
     other_library(_library.PATH)
     with pytest.warns(UserWarning, match="interface"):
         assert mpm.native.backend().name == "xla"
+
+
+@NEEDS_LIBRARY
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="elsewhere there is one instruction set")
+def test_a_processor_without_avx2_sums_by_xla():
+    """The library has no kernels for it, says so, and a step is XLA's. The variable stands for such a processor."""
+    code = "import mpmjax as mpm; from helpers import block; print(mpm.native.backend()); scene, particles = block(2)"
+    code += "; print(mpm.rollout(scene, mpm.prepare(scene, particles), steps=1, dt=1e-3).x.shape)"
+    path = f"{ROOT}{os.pathsep}{ROOT / 'tests'}"
+    environment = os.environ | {"MPMJAX_INSTRUCTIONS": "baseline", "PYTHONPATH": path}
+    out = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    first, second = out.stdout.splitlines()
+    assert first == "XLA (no native library: it has kernels for AVX2 and AVX-512 alone)"
+    assert second == "(36, 2)"
 
 
 def test_numbers_that_have_to_be_equal_are():

@@ -14,7 +14,7 @@ from mpmjax.discretisation._kernel import (
     MLSGradient as MLSGradient,
     SplineGradient as SplineGradient,
 )
-from mpmjax.discretisation._native_sums import stencil_operands as stencil_operands, sums_fit as sums_fit
+from mpmjax.discretisation._native_sums import basis_attributes as basis_attributes, sums_fit as sums_fit
 from mpmjax.discretisation._stencil import (
     Stencil as Stencil,
     first_nodes as first_nodes,

@@ -80,48 +80,17 @@ def _average_jvp(primals: tuple, tangents: tuple, *, batched: int, **params: Any
     first, t, _, *rows = primals
     out = sums_saved_for_backward(_average_sum(*primals, batched=batched, **params))
     changes = scatter_change(first, t, tangents[1], rows, tangents[3:], batched=batched, **params)
-    return out, sum_of_changes(out, [_quotient(*change, *out, batched=batched) for change in changes])
+    return out, sum_of_changes(out, [_divided(*change, *out) for change in changes])
 
 
 def _divided(change: Array, whole: Array, means: Array) -> list[Array]:
     """dM and (d(Σ) − a dM) / M, (n,) and (n, k), from the differentials of the sums, (n, k + 1)."""
     some = whole > 0
-    d_whole = jnp.where(some, change[:, -1], 0)
-    d_means = (change[:, :-1] - means * d_whole[:, None]) / jnp.where(some, whole, 1)[:, None]
-    return [d_whole, jnp.where(some[:, None], d_means, 0)]
+    d_whole = jnp.where(some, change[..., -1], 0)
+    d_means = (change[..., :-1] - means * d_whole[..., None]) / jnp.where(some, whole, 1)[..., None]
+    return [d_whole, jnp.where(some[..., None], d_means, 0)]
 
 
-def _transpose_divided(cotangents: list, change: Any, whole: Array, means: Array, *, batched: int) -> list:
-    del change
-    by_whole = [] if is_zero(cotangents[0]) else [cotangents[0]]
-    by_means = instantiate_zeros(cotangents[1])
-    return [*_quotient_transpose(whole, means, by_means, *by_whole, batched=batched), None, None]
-
-
-def _slope(whole: Array, means: Array, by_means: Array, *by_whole: Array) -> list[Array]:
-    """The transpose of `_divided`: slopes by the sums, (n, k + 1), from those by averages, and by whole weights if they
-    are not zero."""
-    some = whole > 0
-    by_value = jnp.where(some[:, None], by_means, 0) / jnp.where(some, whole, 1)[:, None]
-    by_weight = sum((jnp.where(some, by, 0) for by in by_whole), -(by_value * means).sum(axis=1))
-    return [jnp.concatenate([by_value, by_weight[:, None]], axis=1)]
-
-
-_quotient = NativeFunction(
-    "divided",
-    _divided,
-    lambda change, whole, means: [whole.shape[-1:], means.shape[-2:]],
-    lambda *_, **__: False,
-    differentiable=True,
-)
-_quotient.transpose = _transpose_divided
-_quotient_transpose = NativeFunction(
-    "slope",
-    _slope,
-    lambda whole, means, *_: [(means.shape[-2], means.shape[-1] + 1)],
-    lambda *avals, batched: avals[0].dtype in (np.float32, np.float64) and len({aval.dtype for aval in avals}) == 1,
-    differentiable=True,
-)
 _average_sum = NativeFunction(
     "average",
     _average,

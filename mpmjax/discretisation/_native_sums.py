@@ -1,7 +1,6 @@
 """The sums between particles and nodes by the native library: what it is given, and for which sums it has kernels.
 
-Its kernels sum a value and a gradient, of first nodes and offsets, or of factors: the polynomials' values. A pull is by
-the factors, of which the chain rule makes that by t. All arrays have `batched` leading axes.
+Its kernels sum a value and a gradient, of first nodes and offsets. All arrays have `batched` leading axes.
 """
 
 from collections.abc import Sequence
@@ -27,27 +26,23 @@ def sums_fit(*avals: ShapedArray, basis: Basis, batched: int, groups: Sequence[A
         and all(aval.dtype in (t.dtype, np.bool_) for aval in others)
         and all(some in (basis.value, basis.gradient) for some, _ in terms)
         and len(set(terms)) == len(terms)
+        and len(basis.knots) in (2, 3, 4)
+        and max(len(basis.weights[0]), len(basis.slopes[0])) <= 9  # as in native/problems.h
     )
 
 
-def stencil_operands(basis: Basis, first: Array, t: Array, *along: Array) -> tuple[list[Array], dict[str, bool]]:
-    """A stencil as the library takes it, and attributes that say how: first nodes and offsets where it knows their
-    polynomials, else factors; and the changes of these along dt."""
-    s, batch = len(basis.knots), first.shape[:-2]
-    if not along and not any(basis.periodic) and len(basis.weights[0]) <= s + 1:
-        table = np.zeros((2, s, s + 2), t.dtype)
-        table[:, :, 0] = basis.knots
-        for family, rows in enumerate((basis.weights, basis.slopes)):
-            table[family, :, 1 : 1 + len(rows[0])] = rows
-        fixed = np.array(basis.strides, np.int32), table
-        strides, polynomials = (jnp.broadcast_to(jnp.asarray(a), (*batch, *a.shape)) for a in fixed)
-        return [first, strides, t, polynomials], {"placed": True}
-    return _factors(basis, first, t, *along), {"placed": False}
-
-
-def _factors(basis: Basis, first: Array, t: Array, *along: Array) -> list[Array]:
-    changes = [basis.polynomials((family, 1), t) * dt[..., None, :] for dt in along for family in (0, 1)]
-    return [basis.index_terms(first), basis.polynomials((0, 0), t), basis.polynomials((1, 0), t), *changes]
+def basis_attributes(basis: Basis) -> dict[str, Any]:
+    """A basis as the library is told it, with as many coefficients for each polynomial."""
+    coefficients = np.zeros((2, len(basis.knots), max(len(basis.weights[0]), len(basis.slopes[0]))))
+    for family, rows in enumerate((basis.weights, basis.slopes)):
+        coefficients[family, :, : len(rows[0])] = rows
+    return {
+        "shape": np.array(basis.shape, np.int64),
+        "periodic": np.array(basis.periodic, np.int64),
+        "knots": np.array(basis.knots),
+        "weights": coefficients[0].ravel(),
+        "slopes": coefficients[1].ravel(),
+    }
 
 
 def _given(basis: Basis, amounts: dict[Any, Array]) -> tuple[list[Array], bool]:
@@ -66,11 +61,11 @@ def native_scatter(
     shape = *first.shape[:batched], size, max(a.shape[-2] for a in rows)
     total = []
     for moved in dict.fromkeys(group.moved for group in groups):
-        stencil, told = stencil_operands(basis, first, t, *(along if moved else ()))
         some = {g.terms: a for g, a in zip(groups, rows, strict=True) if g.moved == moved}
         amounts, valued = _given(basis, some)
-        told |= {"differential": moved, "valued": valued}
-        total += call_library("scatter", [*stencil, *amounts], [(shape, t.dtype)], told)
+        operands = [first, t, *(along if moved else ()), *amounts]
+        told = basis_attributes(basis) | {"differential": moved, "valued": valued}
+        total += call_library("scatter", operands, [(shape, t.dtype)], told)
     return [total[0] + total[1]] if len(total) == 2 else total
 
 
@@ -81,9 +76,9 @@ def native_gather(
     *along, nodes = rest
     out = {}
     for moved in {group.moved for group in groups}:
-        stencil, told = stencil_operands(basis, first, t, *(along if moved else ()))
-        results = _gathered(first, nodes)
-        value, gradients = call_library("gather", [*stencil, nodes], results, told | {"differential": moved})
+        operands = [first, t, *(along if moved else ()), nodes]
+        told = basis_attributes(basis) | {"differential": moved}
+        value, gradients = call_library("gather", operands, _gathered(first, nodes), told)
         out[basis.value, moved], out[basis.gradient, moved] = jnp.expand_dims(value, -3), gradients
     return [out[group.terms, group.moved] for group in groups]
 
@@ -100,27 +95,25 @@ def native_pull(
     """`pull` by the library, and with `gathered` the gather of the nodes."""
     terms = [group.terms for group in groups]
     amounts, valued = _given(basis, dict(zip(terms, rows, strict=True)))
-    factors = _factors(basis, first, t)
-    results = [(factors[1].shape, t.dtype)] * 2 + _gathered(first, f) * gathered
-    by_weights, by_slopes, *out = call_library("pull", [*factors, f, *amounts], results, {"valued": valued})
-    by_t = by_weights * basis.polynomials((0, 1), t) + by_slopes * basis.polynomials((1, 1), t)
+    results = [(t.shape, t.dtype), *(_gathered(first, f) if gathered else [])]
+    told = basis_attributes(basis) | {"valued": valued}
+    by_t, *out = call_library("pull", [first, t, f, *amounts], results, told)
     of = {basis.value: jnp.expand_dims(out[0], -3), basis.gradient: out[1]} if gathered else {}
-    return [by_t.sum(axis=-2), *(of[some] for some in terms if gathered)]
+    return [by_t, *(of[some] for some in terms if gathered)]
 
 
 def native_average(
     first: Array, t: Array, least: Array, *rows: Array, basis: Basis, groups: Sequence[Any], size: int, batched: int
 ) -> list[Array]:
     """`average` by the library."""
-    stencil, told = stencil_operands(basis, first, t)
     amounts, _ = _given(basis, dict(zip((group.terms for group in groups), rows, strict=True)))
     batch, columns = first.shape[:batched], rows[0].shape[-2]
     shapes = (size,), (size, columns - 1), (size, columns)  # the last one holds the sums before they are divided
-    return call_library("average", [*stencil, least, *amounts], [((*batch, *s), t.dtype) for s in shapes], told)[:2]
+    results = [((*batch, *s), t.dtype) for s in shapes]
+    return call_library("average", [first, t, least, *amounts], results, basis_attributes(basis))[:2]
 
 
 def native_resist(first: Array, t: Array, upper: Array, u: Array, *, basis: Basis, batched: int) -> list[Array]:
     """`resist` by the library."""
     del batched
-    stencil, told = stencil_operands(basis, first, t)
-    return call_library("resist", [*stencil, upper, u], [(u.shape, u.dtype)], told)
+    return call_library("resist", [first, t, upper, u], [(u.shape, u.dtype)], basis_attributes(basis))

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
-from mpmjax.discretisation import Basis, resist_unscaled, stencil_operands, sums_fit, without_flat
+from mpmjax.discretisation import Basis, basis_attributes, resist_unscaled, sums_fit, without_flat
 from mpmjax.implicit._hessian import ParticleStiffness
 from mpmjax.implicit._linear_solve import (
     NEARLY_CONVERGED,
@@ -357,11 +357,11 @@ def _solve(first: Array, t: Array, *args: Array, basis: Basis) -> list[Array]:
 def _call_solve(first: Array, t: Array, *args: Array, basis: Basis, batched: int) -> list[Array]:
     """By the library, with memory for six vectors. Members of a batch, which run one after the other in a thread, take
     their own."""
-    stencil, told = stencil_operands(basis, first, t)
     results = _native_solve.results(first, t, *args, basis=basis, batched=batched)
     memory = (*first.shape[:batched], 0 if batched else 6 * args[-3].shape[-1])
-    aliases = {len(stencil) + len(args) - 3: 0}
-    return call_library("solve", [*stencil, *args], [*results, (memory, t.dtype)], told, aliases)[:2]
+    aliases = {2 + len(args) - 3: 0}
+    told = basis_attributes(basis)
+    return call_library("solve", [first, t, *args], [*results, (memory, t.dtype)], told, aliases)[:2]
 
 
 # The derivative is that of the loop in JAX, and never taken: solves are not differentiated through their iterations.

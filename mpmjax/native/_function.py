@@ -93,13 +93,15 @@ def call_library(
     name: str,
     args: Sequence[Array],
     results: Sequence[tuple[Shape, Any]],
-    told: dict[str, bool],
+    told: dict[str, Any],
     aliases: dict[int, int] | None = None,
 ) -> list[Array]:
-    """Results, of given shapes and dtypes, of a handler of the library that is told its attributes."""
+    """Results, of given shapes and dtypes, of a handler of the library that is told its attributes: numpy's arrays, and
+    booleans."""
     out = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in results]
     called = jax.ffi.ffi_call(target(name), out, input_output_aliases=aliases or {})
-    return list(called(*args, **{key: np.bool_(value) for key, value in told.items()}))
+    attributes = {key: np.bool_(value) if isinstance(value, bool) else value for key, value in told.items()}
+    return list(called(*args, **attributes))
 
 
 native_p = Primitive("native")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 
-INTERFACE = 11
+INTERFACE = 12
 """The version of the library's interface, as in native/CMakeLists.txt: both change with the handlers' arguments."""
 PATH = Path(__file__).parent / "lib" / "sums.so"
 """In a folder of its own: Python takes a shared library among modules for a module."""
@@ -22,7 +22,6 @@ HANDLERS = (
     "combine",
     "product",
     "solve",
-    "slope",
     "eigen",
     "rotation",
     "order",
@@ -43,7 +42,6 @@ class Library(NamedTuple):
         """The instruction set that it uses on this machine, such as AVX2; None without it."""
         if self.handle is None:
             return None
-        self.handle.mpmjax_instructions.restype = ctypes.c_char_p
         return self.handle.mpmjax_instructions().decode()
 
     @property
@@ -67,7 +65,10 @@ def library() -> Library:
     if not PATH.is_file():
         return Library(None, "it was not built: the installation found no C++ compiler that it could use")
     try:
-        return Library(_registered(ctypes.CDLL(str(PATH))), "")
+        handle = _registered(ctypes.CDLL(str(PATH)))
+        if not handle.mpmjax_instructions():
+            return Library(None, "it has kernels for AVX2 and AVX-512 alone")
+        return Library(handle, "")
     except Exception as error:  # whatever the loader or XLA says of a library that does not fit
         reason = " ".join(str(error).split())
         warnings.warn(
@@ -82,6 +83,7 @@ def _registered(handle: ctypes.CDLL) -> ctypes.CDLL:
     interface = handle.mpmjax_interface()
     if interface != INTERFACE:
         raise RuntimeError(f"it has interface {interface}, and this version of mpmjax needs {INTERFACE}")
+    handle.mpmjax_instructions.restype = ctypes.c_char_p
     for name in (*HANDLERS, "threads"):
         capsule = jax.ffi.pycapsule(getattr(handle, target(name)))
         jax.ffi.register_ffi_target(target(name), capsule, platform="cpu")

@@ -10,16 +10,16 @@
 namespace {
 
 template <class T>
-struct AbreastOf {
+struct SimdOf {
   typedef T type __attribute__((vector_size(kWidest)));
 };
 
 template <class T>
-using Abreast = typename AbreastOf<T>::type;
+using Simd = typename SimdOf<T>::type;
 
 // How many they are.
 template <class T>
-constexpr int64_t kAbreast = kWidest / static_cast<int>(sizeof(T));
+constexpr int64_t kSimdLanes = kWidest / static_cast<int>(sizeof(T));
 
 template <class V>
 MPMJAX_INLINE V magnitude(V x) {
@@ -71,11 +71,11 @@ struct Place {
   size_t bytes;
 
   Place(int64_t k, int64_t last, int64_t particles)
-      : first(k), stride(particles), bytes(sizeof(T) * static_cast<size_t>(std::min(kAbreast<T>, last - k))) {}
+      : first(k), stride(particles), bytes(sizeof(T) * static_cast<size_t>(std::min(kSimdLanes<T>, last - k))) {}
 
   // Row m of an array. Lanes of no particle are zero.
-  MPMJAX_INLINE Abreast<T> load(const T* array, int64_t m) const {
-    Abreast<T> v = {};
+  MPMJAX_INLINE Simd<T> load(const T* array, int64_t m) const {
+    Simd<T> v = {};
     if (bytes == sizeof v) {
       std::memcpy(&v, array + m * stride + first, sizeof v);
     } else {
@@ -84,7 +84,7 @@ struct Place {
     return v;
   }
 
-  MPMJAX_INLINE void store(T* array, int64_t m, Abreast<T> v) const {
+  MPMJAX_INLINE void store(T* array, int64_t m, Simd<T> v) const {
     if (bytes == sizeof v) {
       std::memcpy(array + m * stride + first, &v, sizeof v);
     } else {
