@@ -161,7 +161,7 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
         choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
         # where no kind is given, the one class that is named by itself beside base classes, or the package's only one
-        plain = [a.__name__ for a in options if is_module(a) and not inspect.isabstract(a)]
+        plain = [a.__name__ for a in options if is_module(a) and list(choices(a)) == [a.__name__]]
         evident = plain if len(plain) == 1 else [name for name, c in classes.items() if is_own(c)]
         _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
         _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
