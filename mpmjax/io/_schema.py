@@ -100,11 +100,16 @@ def _can_be_held(hint: Any) -> bool:
 
     def can(a: Any) -> bool:
         if is_module(a):  # made of its fields; those of `equinox.nn` are made of sizes and a key
-            return inspect.isabstract(a) or set(_parameters(a)) <= {f.name for f in fields(a)}
+            return _is_abstract(a) or set(_parameters(a)) <= {f.name for f in fields(a)}
         items = get_args(a) if get_origin(a) in (tuple, list) else ()
         return is_enum(a) or any(_can_be_held(item) for item in items if item is not Ellipsis)
 
     return bool(_forms(hint)) or any(can(a) for a in alternatives(hint))
+
+
+def _is_abstract(hint: Any) -> bool:
+    """Whether an annotation is a base class of modules, by its methods or, if all have defaults, by its name."""
+    return is_module(hint) and (inspect.isabstract(hint) or hint.__name__.startswith("Abstract"))
 
 
 _SMALL = 64  # most numbers that are written out, and that are read as a tuple where both are taken
@@ -157,19 +162,17 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     number = isinstance(data, (int, float)) and not isinstance(data, bool) and (float, 0) in _forms(expected)
     if any(is_module(a) for a in options) and not number:
         table: Any = {"kind": data} if isinstance(data, str) else data
-        opened = any(inspect.isabstract(a) for a in options)  # to classes that are registered
+        opened = any(_is_abstract(a) for a in options)  # to classes that are registered
         _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
         choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
         # where no kind is given, the one class that is named by itself beside base classes, or the package's only one
-        plain = [a.__name__ for a in options if is_module(a) and list(choices(a)) == [a.__name__]]
+        plain = [a.__name__ for a in options if is_module(a) and not _is_abstract(a)]
         evident = plain if len(plain) == 1 else [name for name, c in classes.items() if is_own(c)]
         _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
         _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
         kind = table.get("kind", *evident) if len(evident) == 1 else table["kind"]
         if not (isinstance(kind, str) and kind in classes):
-            more = (
-                " A class of your own is known when the module is imported that calls mpm.register." if opened else ""
-            )
+            more = " A class of your own is known when the module is imported that calls mpm.register."
             named = f"{_named(where, 'unknown kind')} {_short(kind)}{_close(_short(kind), classes)}"
             raise ValueError(f"{named} It must be {choice}.{more * opened}")
         keywords = arguments(classes[kind], {k: v for k, v in table.items() if k != "kind"}, where, arrays)
