@@ -13,7 +13,9 @@
 
 At the public face a particle array starts with p: positions (p, d), deformation gradients (p, d, d). Inside a step,
 small matrices are *component first*, (d, d, p): `F[0, 1]` is then one contiguous array over the particles, which is
-what a CPU vectorises best, and a law reads as on paper. `components` and `particle_first` go between the two.
+what a CPU vectorises best, and a law reads as on paper. `components` and `particle_first` go between the two. Gradients
+have the axes of F, ∇u[a, b] = ∂u_a/∂x_b; `slopes`, which sums give and take, have the derivative's direction first, so
+that each is one more row of a sum: slopes[b, a] = ∂u_a/∂x_b.
 """
 
 from typing import TYPE_CHECKING, Annotated

@@ -63,9 +63,15 @@ def test_the_factor_solves_and_is_as_large_as_was_said(name):
     S = np.where(coupled(box), rng.normal(size=(box.size,) * 2), 0)
     S = S + S.T + np.diag(2 * np.abs(S).sum(axis=1))
     held = jnp.pad(jnp.asarray(S), (0, 1))  # a number past the last has zeros
-    factor = jax.jit(lambda held: dissected_factor(box, lambda rows, columns: held[rows[:, None], columns]))(held)
     right = rng.normal(size=(3, box.size))
-    assert_close(jax.vmap(factor.solve)(jnp.asarray(right)), np.linalg.solve(S, right.T).T, 1e-12)
+
+    @jax.jit
+    def solved(held, right):
+        factor = dissected_factor(box, lambda rows, columns: held[rows[:, None], columns])
+        return factor, jax.vmap(factor.solve)(right)
+
+    factor, solution = solved(held, jnp.asarray(right))
+    assert_close(solution, np.linalg.solve(S, right.T).T, 1e-12)
     assert sum(block.size for block in (*factor.inverse, *factor.below)) == box.entries
 
 
