@@ -103,18 +103,8 @@ def test_walls_are_where_the_boundary_has_them():
     planes = (mpm.ContactPlane(1, 0.2), mpm.SymmetryPlane(0, 1.0, "below"))
     scene = mpm.Scene(mpm.Grid((20, 20), 0.1), LAWS["neo_hookean"], boundary=(box, *planes))
     walls = [wall for boundary in scene.boundary for wall in boundary.walls()]
-    assert [wall[:3] for wall in walls] == [
-        (0, 0.1, 1),
-        (1, 1.5, -1),
-        (1, 0.2, 1),
-        (0, 1.0, -1),
-    ]
-    assert [wall.mirrored for wall in walls] == [
-        False,
-        False,
-        True,
-        True,
-    ]
+    assert [wall[:3] for wall in walls] == [(0, 0.1, 1), (1, 1.5, -1), (1, 0.2, 1), (0, 1.0, -1)]
+    assert [wall.mirrored for wall in walls] == [False, False, True, True]
 
 
 def test_the_ground_is_the_highest_wall_that_bears():

@@ -92,25 +92,25 @@ def end_on_signals() -> None:
     for number in told:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda *_: None)  # the other thread does the work
-    threading.Thread(target=_wait, args=(woken, told), daemon=True).start()
 
+    def wait() -> None:
+        while True:
+            if (number := woken.recv(1)[0]) not in told:
+                continue
+            stop = next((s for s in list(_stops) if s.ready and not s.signal), None)
+            if stop is None:
+                break
+            stop.signal = number  # and the process is left to stop in good order
+            os.write(2, f"mpmjax: {told[number]}. {stop.what}\n".encode())
+        with undisturbed():
+            printed = threading.Thread(target=sys.stdout.flush, daemon=True)  # it may wait for whoever reads
+            printed.start()
+            printed.join(1.0)
+            where = " ".join(report() for report in _reports) or "No file was being written."
+            os.write(2, f"mpmjax: {told[number]}. {where}\n".encode())
+            os._exit(128 + number)
 
-def _wait(woken: socket.socket, told: dict[int, str]) -> None:
-    while True:
-        if (number := woken.recv(1)[0]) not in told:
-            continue
-        stop = next((s for s in list(_stops) if s.ready and not s.signal), None)
-        if stop is None:
-            break
-        stop.signal = number  # and the process is left to stop in good order
-        os.write(2, f"mpmjax: {told[number]}. {stop.what}\n".encode())
-    with undisturbed():
-        printed = threading.Thread(target=sys.stdout.flush, daemon=True)  # it may wait for whoever reads
-        printed.start()
-        printed.join(1.0)
-        where = " ".join(report() for report in _reports) or "No file was being written."
-        os.write(2, f"mpmjax: {told[number]}. {where}\n".encode())
-        os._exit(128 + number)
+    threading.Thread(target=wait, daemon=True).start()
 
 
 @contextmanager

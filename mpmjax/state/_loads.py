@@ -270,7 +270,7 @@ def points_of(
 ) -> tuple[LoadedPoints, ...]:
     """The points of each load of prepared particles at the start of a step."""
     dtype, F = particles.x.dtype, None
-    if any(keeps_deformation(law) for law in laws):
+    if loads and any(keeps_deformation(law) for law in laws):
         still, parts = jnp.eye(particles.dim, dtype=dtype), []  # the identity where a law does not keep it
         for law, stored, count in zip(laws, particles.deformations, particles.sizes, strict=True):
             whole = keeps_deformation(law) and stored is not None
