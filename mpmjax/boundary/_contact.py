@@ -20,6 +20,7 @@ of several stages may let it act after each (see `TRBDF2`).
 import abc
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import reduce
 from itertools import groupby, permutations
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -331,7 +332,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         groups = [list(group) for _, group in groupby(forth, key=lambda k: numbers[k])]
         orders = list(permutations(groups)) if len(groups) <= 3 else [groups, groups[::-1]]
         by_order = [changes([k for group in order for k in group]) for order in orders]
-        total = [sum(each) / len(orders) for each in zip(*by_order, strict=True)]
+        total = [reduce(jnp.add, each) / len(orders) for each in zip(*by_order, strict=True)]
         return self.images.unfold(sum(total, v)), tuple(map(self.images.unfold, total))
 
     def pushes(self, friction_dv: tuple[NodeVector, ...]) -> tuple[tuple[int, NodeVector], ...]:
