@@ -124,8 +124,9 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         forces = (q * (nodes.force if u is None else nodes.potential.force(u)) for q, u in stages)
         return nodes.dt * reduce(jnp.add, forces)
 
-    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
-        return self.elastic_impulse(nodes, motion, exact=True) if self.linearises else None
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt Σ q f(u) [kg m/s], with the forces of the law."""
+        return self.elastic_impulse(nodes, motion, exact=True)
 
     def mean_displacement(
         self, nodes: Nodes, motion: NodeMotion, stages: tuple[tuple[Scalar, NodeVector | None], ...] | None = None
