@@ -20,7 +20,8 @@ of several stages may let it act after each (see `TRBDF2`).
 import abc
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import groupby
+from functools import reduce
+from itertools import groupby, permutations
 from typing import Any, ClassVar, Generic, TypeVar
 
 import equinox as eqx
@@ -304,10 +305,10 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, tuple[NodeVector, ...]]:
         """The velocity after Coulomb friction, and the change of velocity by each contact [m/s].
 
-        Contacts act one after the other: boundary by boundary in the scene's order, then pairs of bodies; and, from the
-        same start, in the reverse order. Each has the mean of its two changes, so that of two boundaries at a node none
-        comes first. The mean is within the limit and takes energy, as both are and do. The residual is without the
-        impulses of springs.
+        Boundaries and pairs of bodies act one after the other: of at most three in every order, of more in the scene's
+        and the reverse, each from the same start. Each contact has the mean of its changes, so that none comes first.
+        The mean is within the limit and takes energy, as each is and does. The residual is without the impulses of
+        springs.
         """
         tied, nodes, contacts = Mirror(self.nodes.mirror.rigid), self.nodes, self.unconstrained.contacts
         rubbing = self if nodes.loose is None else replace(self, nodes=nodes.loose)
@@ -329,10 +330,9 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         numbers = [-1 - k if number is None else number for k, number in enumerate(nodes.brought_by)]
         forth = [k for k in range(len(contacts)) if frictions[k] is not None]
         groups = [list(group) for _, group in groupby(forth, key=lambda k: numbers[k])]
-        total = changes(forth)
-        if len(groups) > 1:
-            back = changes([k for group in reversed(groups) for k in group])
-            total = [(a + b) / 2 for a, b in zip(total, back, strict=True)]
+        orders = list(permutations(groups)) if len(groups) <= 3 else [groups, groups[::-1]]
+        by_order = [changes([k for group in order for k in group]) for order in orders]
+        total = [reduce(jnp.add, each) / len(orders) for each in zip(*by_order, strict=True)]
         return self.images.unfold(sum(total, v)), tuple(map(self.images.unfold, total))
 
     def pushes(self, friction_dv: tuple[NodeVector, ...]) -> tuple[tuple[int, NodeVector], ...]:

@@ -64,7 +64,7 @@ class StageFriction(eqx.Module):
             nodes.velocity + (v - nodes.velocity) / share,
             resisted=u / (share * nodes.dt) if nodes.potential.viscous else None,
         )
-        missing = reaction(nodes, motion, method.impulse_of(nodes, ((0.5, None), (0.5, u))))
+        missing = reaction(nodes, motion, method.elastic_impulse(nodes, motion, ((0.5, None), (0.5, u))))
         # the share γ of an impulse on a mass is that impulse on 1/γ of the mass
         rubbed, loose = (each and replace(each, mass=each.mass / share) for each in (rubbed, rubbed.loose))
         held = replace(self.held, displacement=u / 2, nodes=replace(rubbed, loose=loose))
@@ -77,29 +77,30 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 
     def solve(
         held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
-    ) -> tuple[ConstrainedNodes, NodeMotion, SolveInfo]:
+    ) -> tuple[ConstrainedNodes, NodeMotion, NodeMotion, SolveInfo]:
         motion, info = advance(replace(held.nodes, friction=StageFriction(held)), method, guess)
-        motion = jax.tree.map(held.images.unfold, motion)
-        return replace(held, displacement=method.mean_displacement(held.nodes, motion)), motion, info
+        motion = solved = jax.tree.map(held.images.unfold, motion)
+        if motion.friction is not None:
+            solved = replace(motion, velocity=motion.velocity - motion.friction)
+        return replace(held, displacement=method.mean_displacement(held.nodes, motion)), motion, solved, info
 
     frozen, frozen_method, guess = without_derivative((nodes, method, method.initial_guess(nodes)))
 
     def attempt(held: ConstrainedNodes, guess: NodeVector) -> tuple:
-        held, motion, info = solve(held, frozen_method, guess)
-        elastic = elastic_impulse(frozen, frozen_method, motion)
-        missing = reaction(frozen, motion.without_friction(), elastic)
+        held, motion, solved, info = solve(held, frozen_method, guess)
+        missing = reaction(frozen, solved, elastic_impulse(frozen, frozen_method, motion))
         return held, motion.velocity, held.without_spring_impulses(missing), motion.carrier, info
 
     start = frozen_method.mean_displacement(frozen, NodeMotion(guess))
     active, guess, cost, sweeps = saved_for_backward(
         find_active_set(frozen, guess, start, attempt, no_solve(guess.dtype), explicit=method.is_explicit)
     )
-    held, motion, info = solve(constrain(nodes, active), method, guess)
-    elastic, solved = elastic_impulse(nodes, method, motion), motion.without_friction()
+    held, motion, solved, info = solve(constrain(nodes, active), method, guess)
+    elastic = elastic_impulse(nodes, method, motion)
     holding = held.without_spring_impulses(reaction(nodes, solved, elastic))
     velocity, friction = held.friction(solved.velocity, holding)
     contact = ContactInfo(sweeps, count_places(nodes, *held.violations(solved.velocity, holding)))
-    motion = motion.with_friction(velocity - motion.velocity, method.share_in_mean())
+    motion = method.with_friction(motion, velocity - motion.velocity)
     return GridUpdate(motion, solved, elastic, cost.followed_by(info), held, friction, contact)
 
 

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from typing import ClassVar
 
@@ -106,27 +107,33 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         problem = problem.linearised() if self.linearises else problem
         return solve(problem, guess, self.solved_by(), self.adjoint_solver)
 
-    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
-        """Δt Σ q f(u) [kg m/s], with the forces that the solution takes."""
-        return self.impulse_of(nodes, self.stages(nodes, motion))
-
-    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
-        """Δt Σ q f(u) [kg m/s], with the forces of the law."""
-        return self.impulse_of(nodes, self.stages(nodes, motion), exact=True)
-
-    def impulse_of(
-        self, nodes: Nodes, stages: tuple[tuple[Scalar, NodeVector | None], ...], *, exact: bool = False
+    def elastic_impulse(
+        self,
+        nodes: Nodes,
+        motion: NodeMotion,
+        stages: tuple[tuple[Scalar, NodeVector | None], ...] | None = None,
+        *,
+        exact: bool = False,
     ) -> NodeVector:
-        """Δt Σ q f(u) [kg m/s] of some stages, with the forces that the solution takes, or exactly those of the law."""
+        """Δt Σ q f(u) [kg m/s] of the motion's stages or of others, with the forces that the solution takes or exactly
+        those of the law."""
+        stages = self.stages(nodes, motion) if stages is None else stages
         if self.linearises and not exact:
-            stiffness = self.hessian.at(nodes.potential, None)
-            return nodes.dt * (sum(q for q, _ in stages) * nodes.force - stiffness(_mean(stages)))
+            stiffness, mean = self.hessian.at(nodes.potential, None), self.mean_displacement(nodes, motion, stages)
+            return nodes.dt * (sum(q for q, _ in stages) * nodes.force - stiffness(mean))
         forces = (q * (nodes.force if u is None else nodes.potential.force(u)) for q, u in stages)
         return nodes.dt * reduce(jnp.add, forces)
 
-    def mean_displacement(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
-        """Σ q u [m] of the stages."""
-        return _mean(self.stages(nodes, motion))
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt Σ q f(u) [kg m/s], with the forces of the law."""
+        return self.elastic_impulse(nodes, motion, exact=True)
+
+    def mean_displacement(
+        self, nodes: Nodes, motion: NodeMotion, stages: tuple[tuple[Scalar, NodeVector | None], ...] | None = None
+    ) -> NodeVector:
+        """Σ q u [m] of the motion's stages or of others."""
+        stages = self.stages(nodes, motion) if stages is None else stages
+        return reduce(jnp.add, (q * u for q, u in stages if u is not None))
 
     def stability_factor(self) -> Scalar:
         return 0.0
@@ -333,9 +340,10 @@ class TRBDF2(AbstractImplicitIntegrator):
         mean, resisted = (q0 * v0 + q1 * u + q2 * v for u in (middle, solved))
         return NodeMotion(v, mean, inner, resisted if viscous else None, friction), first.together_with(second)
 
-    def share_in_mean(self) -> Scalar:
-        """q_2."""
-        return self.weights()[3]
+    def with_friction(self, motion: NodeMotion, change: NodeVector) -> NodeMotion:
+        """The mean takes q_2 of the change, as of the velocity at the step's end."""
+        mean = motion.carrier + self.weights()[3] * change
+        return replace(motion, velocity=motion.velocity + change, mean=mean)
 
     def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector | None], ...]:
         """Stages at 0, γΔt and Δt."""
@@ -346,8 +354,3 @@ class TRBDF2(AbstractImplicitIntegrator):
     def force_at(self) -> Scalar:
         """½."""
         return 0.5
-
-
-def _mean(stages: tuple[tuple[Scalar, NodeVector | None], ...]) -> NodeVector:
-    """Σ q u [m] of stages, shape (n, d)."""
-    return reduce(jnp.add, (q * u for q, u in stages if u is not None))

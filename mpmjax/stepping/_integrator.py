@@ -31,15 +31,6 @@ class NodeMotion(eqx.Module):
         """The velocity with which positions and deformation move [m/s], shape (n, d)."""
         return self.velocity if self.mean is None else self.mean
 
-    def with_friction(self, change: NodeVector, share: Scalar = 0.5) -> "NodeMotion":
-        """The motion with the velocity changed by `change` [m/s], and the mean by this share of it."""
-        mean = None if self.mean is None else self.mean + share * change
-        return replace(self, velocity=self.velocity + change, mean=mean)
-
-    def without_friction(self) -> "NodeMotion":
-        """The motion whose velocity is without the friction of inner stages."""
-        return self if self.friction is None else replace(self, velocity=self.velocity - self.friction, friction=None)
-
 
 class AbstractIntegrator(eqx.Module):
     """The update of the nodes' velocity in a step.
@@ -108,10 +99,11 @@ class AbstractIntegrator(eqx.Module):
         share = self.force_at()
         return None if share is None else share * nodes.dt * motion.carrier
 
-    def share_in_mean(self) -> Scalar:
-        """The share of a change of v^{n+1} by friction that the mean velocity takes. Default: ½, as of an impulse that
-        acts evenly over the step."""
-        return 0.5
+    def with_friction(self, motion: NodeMotion, change: NodeVector) -> NodeMotion:
+        """The motion with v^{n+1} changed by friction [m/s]. Default: the mean velocity by half of it, as by an impulse
+        that acts evenly over the step."""
+        mean = None if motion.mean is None else motion.mean + change / 2
+        return replace(motion, velocity=motion.velocity + change, mean=mean)
 
     def limit_name(self) -> str:
         """The name of the bound on the step in messages."""
