@@ -254,7 +254,7 @@ class PlaneContact(AbstractContact):
 class ContactPlane(AbstractPlane):
     """A rigid plane that the material may leave, and along which it slides with Coulomb friction.
 
-    Where it touches, nodes beyond the plane are mirror images, as at a `SymmetryPlane`; where it does not, they are
+    Where it touches, nodes beyond the plane are mirror images of the first node before it; where it does not, they are
     nodes like any other. Which it is, is decided for each column of nodes along the normal: either the wall holds the
     column and pushes, or the column moves inward and the wall does nothing (see `AbstractContact`). Friction is
     an impulse applied after the solve, opposed to the tangential velocity and at most `friction` times the column's

@@ -156,6 +156,9 @@ class SeparatingBox(AbstractBox):
 
     Walls lie anywhere, and have derivatives by their place.
 
+    A fluid is held as by a `ContactPlane`, but with walls anywhere, so that it stays at rest: its impact is without
+    bounce, and its motion has no derivative by a wall's place.
+
     *When it breaks*: particles that start nearer to a wall than half their width are pushed away as if they were
     compressed by that much. A pressure of a twentieth of M presses by more than 2 % of a spacing.
 
