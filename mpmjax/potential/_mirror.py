@@ -3,8 +3,8 @@
 Nodes beyond such a plane are signed copies of those before it. With B the map from true nodes to all nodes, masses,
 momenta and forces are folded with Bᵀ and velocities unfolded with B, so that every system keeps its symmetry: the
 implicit one is Bᵀ(M + βΔt²H)B. The transfers know nothing of it. At a `SymmetryPlane` B is always that of the plane; at
-a wall that may be left only in the *columns* (lines of nodes along the normal) that it holds. Rigid parts and bodies are
-such maps too.
+a wall that may be left only in the *columns* (lines of nodes along the normal) that it holds. Rigid parts and bodies
+are such maps too.
 """
 
 import math
