@@ -43,7 +43,7 @@ def rest(cells: int = 8) -> None:
     modulus = 40 * WATER * G * deep
 
     for kind, at, times in (
-        *(("SeparatingBox", at, times) for at in (0.0, 0.25, 0.5) for times in (0.7, 9.0)),
+        *(("SeparatingBox", at, times) for at in (0.0, 0.1, 0.25, 0.5) for times in (0.7, 9.0)),
         *((kind, at, times) for kind in ("ContactPlane", "SymmetryPlane") for at in (0.0, 0.5) for times in (0.7, 9.0)),
     ):
         low = at * dx

@@ -352,11 +352,13 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     """The nodes with an active set held; no contact may hold anything of them yet."""
     pairs = list(zip(nodes.contacts, active, strict=True))
-    images = Mirror(tuple(image.within(mask) for contact, mask in pairs if (image := contact.mirror_image) is not None))
+    held = [image.within(mask) for contact, mask in pairs if (image := contact.mirror_image) is not None]
+    images = [image.with_one_mass(nodes.mass, Mirror((*held[:k], *held[k + 1 :]))) for k, image in enumerate(held)]
     fixed = nodes.conditions.fixed
     for contact, mask in pairs:
         fixed = fixed | contact.fixed(mask, fixed.shape)
     springs = tuple(term for contact, mask in pairs if (term := contact.springs(mask)) is not None)
+    images = Mirror(tuple(images))
     return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, springs))
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, ParticleVector, Scalar
@@ -12,11 +13,11 @@ from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, cross
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 from mpmjax.boundary._friction import friction_change
-from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
+from mpmjax.boundary._surface_contact import Faces, Surface, SurfaceContact, refuse_contact, surface_contact
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import Motion
-from mpmjax.potential import Image, Mirror, MirrorPlace, mirror_image
+from mpmjax.potential import Image, Mirror, MirrorPlace, mirror_image, wall_image
 
 SHUT = 1e-2
 """The gap up to which a plane holds what is before it, in spacings."""
@@ -92,10 +93,6 @@ class AbstractPlane(AbstractBoundary):
     def walls(self) -> tuple[Wall, ...]:
         return (Wall(self.axis, float(self.position), self.inward, mirrored=True),)
 
-    def image(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:
-        """The mirror in the window, and how many half spacings each node along the axis lies before it."""
-        return mirror_image(self.axis, self.position, self.keep, grid, window)
-
 
 class SymmetryPlane(AbstractPlane):
     """A plane of mirror symmetry: nodes beyond it are mirror images. It is also a frictionless wall that
@@ -159,27 +156,28 @@ class SymmetryPlane(AbstractPlane):
     def mirror_images(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> tuple[Image, ...]:
         """The mirror image of this plane, in all columns."""
         velocity = None if self.motion is None else self.motion.velocity(t, dt)[self.axis]
-        return (replace(self.image(grid, window)[0], velocity=velocity),)
+        return (replace(mirror_image(self.axis, self.position, self.keep, grid, window), velocity=velocity),)
 
 
 class PlaneContact(AbstractContact):
-    """A contact plane in the window. Each column of nodes along its normal is a place, described at all of its nodes.
+    """A wall at right angles to an axis in the window. Each column of nodes along its normal is a place, described at
+    all of its nodes.
 
-    Holding a column means that its nodes beyond the plane mirror those before it. The normal impulse r is that of the
-    column's nodes on the plane and twice that of the images (a node and its image share equally). The gap velocity is
-    what r works on: the mean, with weights 2 m m'/(m + m'), of the v + v' of nodes and their images, and of the v of
-    nodes on the plane (where the two are one). So an explicit step that holds the column has
-    r = −Σ 2 m m'/(m + m') (v* + v*'), and the two conditions exclude each other. Columns that no particle reaches whose
-    face is at the plane are not held. Columns that are each other's image in another plane are held together. Friction
-    acts on the column's node on the plane, or half a spacing before it.
+    Holding a column means that its nodes move by the wall's map (see `wall_image`), with normal velocities B_i v_b. The
+    normal impulse is r = Σ (1 − B_i) R_i, with R the impulses that are missing at the nodes: what they leave on b is
+    Σ B_i R_i = 0. The gap velocity is what r works on, −r of an explicit step that holds the column:
+
+        Σ m_i (1 − B_i S/M) (v_i − B_i v_b),   S = Σ B m,   M = Σ B² m,
+
+    so that the two conditions exclude each other. Columns that no particle reaches whose face is at the wall are not
+    held. Columns that are each other's image in another plane are held together. Friction acts on the first node of a
+    column that has a tangential velocity of its own.
     """
 
     image: Image
-    """The mirror."""
+    """The wall's map."""
     inward: int = eqx.field(static=True)
     """The inward normal's component: +1 or −1."""
-    before: Int[Array, "m"]
-    """How many half spacings each node along the axis lies before the plane, shape (m,)."""
     coefficient: Scalar
     """Coulomb coefficient [-]."""
     shut: Bool[Array, "n"] | None = None
@@ -190,8 +188,8 @@ class PlaneContact(AbstractContact):
         return self.image
 
     def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> NodeScalar:
-        """The momentum with which each column leaves the plane [kg m/s]: its weights times what its velocity lacks of
-        the mirror's."""
+        """The momentum with which each column leaves the wall [kg m/s]: its weights times what its velocity lacks of
+        the map's."""
         lacking = (v - self.image.vector(v))[:, self.image.axis]
         columns = self.inward * self.image.column(self._weight(held.unconstrained.mass) * lacking)
         return self._tied(held, columns if self.shut is None else jnp.where(self.shut, columns, 0))
@@ -214,30 +212,35 @@ class PlaneContact(AbstractContact):
         return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, 0.0, limit, v)
 
     def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """The normal component of the nodes on the plane."""
-        on_plane = self.image.along(self.before == 0)
-        return (active & on_plane)[:, None] & (jnp.arange(shape[1]) == self.image.axis)
+        """The normal component of nodes that follow in it alone, as on the wall."""
+        across = self.image.along(self.image.follows & self._stays)
+        return (active & across)[:, None] & (jnp.arange(shape[1]) == self.image.axis)
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """All components of the columns held."""
         return jnp.broadcast_to(active[:, None], shape)
 
     def representative(self) -> Bool[Array, "n"]:
-        """The node on the plane or, where there is none, half a spacing before it."""
-        return self.image.along((self.before == 0) | (self.before == 1))
+        """The first node with a tangential velocity of its own."""
+        before = self._stays[:: self.inward]
+        return self.image.along((before & (jnp.cumsum(before) == 1))[:: self.inward])
+
+    @property
+    def _stays(self) -> Bool[Array, "m"]:
+        """Whether a node has its own tangential velocity."""
+        return self.image.source == jnp.arange(len(self.image.source), dtype=jnp.int32)
 
     def _weight(self, mass: NodeScalar) -> NodeScalar:
-        """2 m m'/(m + m') [kg] at nodes beyond the plane, m on it, zero before it, shape (n,)."""
-        mirrored = self.image.scalar(mass)
-        both = mass + mirrored
-        harmonic = 2 * mass * mirrored / jnp.where(both == 0, 1, both)
-        return jnp.where(self.image.along(self.before <= 0), harmonic, 0)
+        """m_i (1 − B_i S/M) [kg] of the nodes that follow b, zero at others, shape (n,)."""
+        share = self.image.along(self.image.shares)
+        first, second = self.image.column(mass * share), self.image.column(mass * share**2)
+        weight = mass * (1 - share * first / jnp.where(second == 0, 1, second))
+        return jnp.where(self.image.along(self.image.follows), weight, 0)
 
     def _column_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
         """The normal impulse that holds each column by itself [kg m/s], shape (n,)."""
         impulse = held.without_collider_impulses(residual)
-        share = self.image.along(jnp.where(self.before < 0, 2, jnp.where(self.before == 0, 1, 0)))
-        return self.inward * self.image.column(share.astype(impulse.dtype) * impulse[:, self.image.axis])
+        return self.inward * self.image.column(self.image.along(1 - self.image.odd) * impulse[:, self.image.axis])
 
     def _tied(self, held: ConstrainedNodes, columns: NodeScalar) -> NodeScalar:
         """A quantity of the columns, summed over columns that are each other's image in other planes, shape (n,)."""
@@ -251,7 +254,7 @@ class PlaneContact(AbstractContact):
 class ContactPlane(AbstractPlane):
     """A rigid plane that the material may leave, and along which it slides with Coulomb friction.
 
-    Where it touches, nodes beyond the plane are mirror images, as at a `SymmetryPlane`; where it does not, they are
+    Where it touches, nodes beyond the plane are mirror images of the first node before it; where it does not, they are
     nodes like any other. Which it is, is decided for each column of nodes along the normal: either the wall holds the
     column and pushes, or the column moves inward and the wall does nothing (see `AbstractContact`). Friction is
     an impulse applied after the solve, opposed to the tangential velocity and at most `friction` times the column's
@@ -302,14 +305,31 @@ class ContactPlane(AbstractPlane):
         a gap at once, the faces before the plane are pushed as by a `SeparatingBox` in the step that would bring them
         behind it."""
         del t, dt
-        image, before = self.image(grid, window)
-        plane = PlaneContact(image, self.inward, before, self.friction)
+        position = jax.lax.stop_gradient(self.position)  # the lattice goes with it
         if faces is None:
-            return (plane,)
+            image = wall_image(self.axis, position, self.inward, grid, window, 2)
+            return (PlaneContact(image, self.inward, self.friction),)
         normal = jnp.zeros_like(faces.x.T).at[self.axis].set(self.inward)
         distance = self.inward * (faces.x[:, self.axis] - self.position)
         landing = surface_contact(Surface(distance, normal, self.friction, axis=self.axis), faces)
         shut = landing.gap <= SHUT * faces.spacing
-        around = scatter(faces.stencil, shut.astype(faces.stencil.offset.dtype), None, grid.size)
-        plane = replace(plane, shut=image.column(around[:, 0]) > 0)
+        plane = plane_contact(landing, shut[0], position, self.inward, grid, window)
         return (plane,) if faces.explicit else (replace(landing, beside=~shut), plane)
+
+
+def plane_contact(
+    surface: SurfaceContact,
+    shut: Bool[Array, "p"],
+    position: Scalar,
+    inward: int,
+    grid: Grid,
+    window: Int[Array, "d"],
+    slope: NodeScalar | None = None,
+) -> PlaneContact:
+    """The contact of a wall across the axis of a surface, at a coordinate [m], with the columns that the particles
+    reach whose gap is shut (see `wall_image`)."""
+    stencil, axis = surface.faces.stencil, surface.axis
+    assert axis is not None
+    image = wall_image(axis, position, inward, grid, window, len(stencil.basis.knots) - 1, slope)
+    around = scatter(stencil, shut[None].astype(stencil.offset.dtype), None, grid.size)
+    return PlaneContact(image, inward, surface.coefficient, image.column(around[:, 0]) > 0)

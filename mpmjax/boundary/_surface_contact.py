@@ -49,6 +49,8 @@ class FaceShape(eqx.Module):
     """First particle, and the one after the last."""
     total: bool = eqx.field(static=True)
     """Whether gradients are with respect to the reference positions."""
+    flows: bool = eqx.field(static=True, default=False)
+    """Whether the material resists changes of volume alone."""
 
     def width(self, n: Float[Array, "d q"]) -> tuple[Float[Array, "q"], Float[Array, "d q"]]:
         """h [m], shape (q,), and the arm b [m] from the face to the centre, shape (d, q): δh = n · ∇u b for a

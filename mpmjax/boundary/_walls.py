@@ -1,5 +1,6 @@
 """Walls along the axes: boxes that hold, let slide, or let go."""
 
+from dataclasses import replace
 from functools import reduce
 from typing import ClassVar
 
@@ -7,12 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Corner, Float, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Corner, Float, Int, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
-from mpmjax.boundary._surface_contact import Surface, refuse_contact
+from mpmjax.boundary._contact import AbstractContact
+from mpmjax.boundary._planes import SHUT, plane_contact
+from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
-from mpmjax.discretisation import Grid
+from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import Motion
 
 
@@ -153,6 +156,9 @@ class SeparatingBox(AbstractBox):
 
     Walls lie anywhere, and have derivatives by their place.
 
+    A fluid is held as by a `ContactPlane`, but with walls anywhere, so that it stays at rest: its impact is without
+    bounce, and its motion has no derivative by a wall's place.
+
     *When it breaks*: particles that start nearer to a wall than half their width are pushed away as if they were
     compressed by that much. A pressure of a twentieth of M presses by more than 2 % of a spacing.
 
@@ -185,6 +191,29 @@ class SeparatingBox(AbstractBox):
             Surface(above[axis], normal, self.friction, axis=axis, opposite=below[axis])
             for axis, normal in enumerate(normals)
         )
+
+    def contacts(
+        self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+    ) -> tuple[AbstractContact, ...]:
+        """Springs, and for what flows two walls an axis that hold the columns of nodes whose gap is shut; as at a
+        `ContactPlane` springs push it in the implicit step that would bring its faces behind a wall."""
+        if faces is None:
+            return ()
+        surfaces = tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
+        if not any(shape.flows for shape in faces.shapes):
+            return surfaces
+        flowing = np.repeat([shape.flows for shape in faces.shapes], [len(shape.half) for shape in faces.shapes])
+        contacts: list[AbstractContact] = []
+        for axis, surface in enumerate(surfaces):
+            shut = flowing & (surface.gap <= SHUT * faces.spacing)
+            if not (faces.explicit and flowing.all()):
+                contacts.append(replace(surface, beside=~(shut | (flowing & faces.explicit))))
+            volume = jnp.where(flowing, 2 * faces.width(surface.normal)[0], 0) ** self.dim
+            slope = scatter(faces.stencil, None, (surface.normal * volume)[:, None], grid.size)[:, 0]
+            for side, (wall, inward) in enumerate(((self.lower, 1), (self.upper, -1))):
+                position = jnp.asarray(wall)[axis]
+                contacts.append(plane_contact(surface, shut[side], position, inward, grid, window, slope))
+        return tuple(contacts)
 
     def deepest(self, wall: Array, spacing: Scalar, reach: float) -> Array:
         """A spacing beyond the wall: what is deeper is not pushed."""

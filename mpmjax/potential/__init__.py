@@ -8,6 +8,7 @@ from mpmjax.potential._mirror import (
     Tie as Tie,
     carried_by as carried_by,
     mirror_image as mirror_image,
+    wall_image as wall_image,
 )
 from mpmjax.potential._term import (
     AbstractSpring as AbstractSpring,

@@ -3,8 +3,8 @@
 Nodes beyond such a plane are signed copies of those before it. With B the map from true nodes to all nodes, masses,
 momenta and forces are folded with Bᵀ and velocities unfolded with B, so that every system keeps its symmetry: the
 implicit one is Bᵀ(M + βΔt²H)B. The transfers know nothing of it. At a `SymmetryPlane` B is always that of the plane; at
-a `ContactPlane` only in the *columns* (lines of nodes along the normal) that it holds. Rigid parts and bodies are such
-maps too.
+a wall that may be left only in the *columns* (lines of nodes along the normal) that it holds. Rigid parts and bodies
+are such maps too.
 """
 
 import math
@@ -63,10 +63,14 @@ class Image(eqx.Module):
     """The node of which each node along the axis is a copy, shape (m,)."""
     even: Int[Array, "m"]
     """The sign of copies of even fields, 0 where the source is outside of the window, shape (m,)."""
-    odd: Int[Array, "m"]
-    """The sign of copies of odd fields, 0 on the plane too, shape (m,)."""
+    odd: Int[Array, "m"] | Float[Array, "m"]
+    """The factor of copies of odd fields: a sign, 0 on the plane too, or B (see `wall_image`), shape (m,)."""
     held: Bool[Array, "n"] | None = None
     """The nodes in columns where there is a mirror; None for all of them."""
+    base: Int[Array, ""] | None = None
+    """The node b of a wall that lies anywhere (see `wall_image`); None at a mirror plane."""
+    scale: NodeScalar | None = None
+    """Factor of the normal velocity of b and of what follows it [-], shape (n,) (see `with_one_mass`); None for 1."""
     velocity: Scalar | None = None
     """Velocity V of a mirror that moves along its normal [m/s]; None at rest. The normal velocity of a node beyond it
     is 2V minus that of its image, and V on it."""
@@ -78,13 +82,18 @@ class Image(eqx.Module):
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
         """B for an even scalar field."""
-        return self._copy(field[:, None], self.even[:, None]).reshape(field.shape)
+        return self._copy(field[:, None], self.source, self.even[:, None]).reshape(field.shape)
 
     def vector(self, field: NodeVector) -> NodeVector:
         """B for a vector field: tangential components even, the normal one odd. Of a mirror that moves B v + ℓ, where ℓ
         is the normal component that the field has on the mirror and beyond."""
         normal = jnp.arange(field.shape[1]) == self.axis
-        copied = self._copy(field, jnp.where(normal, self.odd[:, None], self.even[:, None]))
+        if self.base is not None:
+            source = jnp.where(self.follows, self.base, jnp.arange(len(self.odd), dtype=jnp.int32))
+            across = self._copy(field, source, self.odd[:, None])
+            across = across if self.scale is None else self.scale[:, None] * across
+            return jnp.where(normal, across, self._copy(field, self.source, self.even[:, None]))
+        copied = self._copy(field, self.source, jnp.where(normal, self.odd[:, None], self.even[:, None]))
         if self.velocity is None:
             return copied
         return copied + jnp.where(self.normal(self.odd <= 0, field.shape[1]), field, 0)
@@ -92,6 +101,29 @@ class Image(eqx.Module):
     def within(self, held: Bool[Array, "n"]) -> "Image":
         """The mirror in some columns only."""
         return replace(self, held=held)
+
+    @property
+    def follows(self) -> Bool[Array, "m"]:
+        """The nodes whose normal velocity is that of b times less than 1."""
+        return self.odd < 1
+
+    @property
+    def shares(self) -> Float[Array, "m"]:
+        """B of b and of the nodes that follow it, zero at others."""
+        return jnp.where(self.follows | (jnp.arange(len(self.odd), dtype=jnp.int32) == self.base), self.odd, 0)
+
+    def with_one_mass(self, mass: NodeScalar, others: "Mirror") -> "Image":
+        """The map whose b has the mass Σ m along the wall and across it, by a unit of the velocity across it: there it
+        is Σ B² m. `others` are the maps that fold the masses of all nodes [kg], shape (n,), before."""
+        if self.base is None:
+            return self
+        mass = others.fold_scalar(mass)
+        across = self.column(mass * self.along(self.shares**2))
+        along = self.column(jnp.where(self.along(self.source == self.base), mass, 0))
+        both = (across > 0) & (along > 0)
+        scale = jnp.sqrt(jnp.where(both, along / jnp.where(both, across, 1), 1))
+        held = self.along(self.shares != 0) if self.held is None else self.held & self.along(self.shares != 0)
+        return replace(self, scale=others.unfold_scalar(jnp.where(held, scale, 1)))
 
     def normal(self, along: Bool[Array, "m"], dim: int) -> Mask:
         """The normal component of some nodes along the axis, as a mask of shape (n, d)."""
@@ -108,12 +140,12 @@ class Image(eqx.Module):
         blocks = field.reshape(self.layers, *self.shape)
         return jnp.broadcast_to(blocks.sum(axis=self.axis + 1, keepdims=True), blocks.shape).reshape(-1)
 
-    def _copy(self, field: Array, sign: Array) -> Array:
-        """Copy along the axis; `sign` has one row a node of the axis and one column a component."""
+    def _copy(self, field: Array, source: Array, sign: Array) -> Array:
+        """Copy from `source` along the axis; `sign` has one row a node of the axis and one column a component."""
         blocks = field.reshape(self.layers, *self.shape, -1)
         by_axis = [1] * blocks.ndim
         by_axis[self.axis + 1], by_axis[-1] = sign.shape
-        copied = jnp.take(blocks, self.source, axis=self.axis + 1) * sign.reshape(by_axis).astype(field.dtype)
+        copied = jnp.take(blocks, source, axis=self.axis + 1) * sign.reshape(by_axis).astype(field.dtype)
         copied = copied.reshape(field.shape)
         return copied if self.held is None else jnp.where(self.held[:, None], copied, field)
 
@@ -249,11 +281,9 @@ class Mirror(eqx.Module):
         return tuple(image for image in self.images if isinstance(image, RigidImage))
 
 
-def mirror_image(axis: int, position: Scalar, keep: str, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:
-    """The map of a mirror from true nodes to all nodes of the window, and how many half spacings each node along the
-    axis lies before it. True nodes are "above" or "below" the mirror, whose coordinate [m] is a multiple of half a
-    spacing.
-    """
+def mirror_image(axis: int, position: Scalar, keep: str, grid: Grid, window: Int[Array, "d"]) -> Image:
+    """The map of a mirror from true nodes to all nodes of the window. True nodes are "above" or "below" the mirror,
+    whose coordinate [m] is a multiple of half a spacing."""
     length = grid.shape[axis]
     j = jnp.arange(length, dtype=jnp.int32)
     halves = jnp.round(2 * jnp.asarray(position) / grid.spacing).astype(jnp.int32) - 2 * window[axis]
@@ -263,4 +293,43 @@ def mirror_image(axis: int, position: Scalar, keep: str, grid: Grid, window: Int
     inside = (source >= 0) & (source < length)
     even = jnp.where(inside, 1, 0)
     odd = jnp.where(inside & (before != 0), jnp.where(ghost, -1, 1), 0)
-    return Image(grid.shape, grid.layers, axis, jnp.clip(source, 0, length - 1), even, odd), before
+    return Image(grid.shape, grid.layers, axis, jnp.clip(source, 0, length - 1), even, odd)
+
+
+def wall_image(
+    axis: int,
+    position: Scalar,
+    inward: int,
+    grid: Grid,
+    window: Int[Array, "d"],
+    order: int,
+    slope: NodeScalar | None = None,
+) -> Image:
+    """The map of a wall at any coordinate [m] along an axis, for a kernel of this order.
+
+    With ξ the distance of a node before the wall, b is the nearest one before it that no kernel at the wall passes:
+    ξ_b ≥ ½ for quadratic kernels. Nodes behind b have its normal velocity times B = ξ/ξ_b, so that it is zero on the
+    wall, and fields that are linear across it are in the map: forces of a uniform pressure, which have neither sum nor
+    first moment about the wall, vanish. Nodes more than a quarter of a spacing behind the wall have the tangential
+    velocity of b. With the wall on a node or half-way between nodes this is the mirror.
+
+    Sums over particles are no integrals: by `slope`, the volumes of particles times g_ip along the axis, summed at the
+    nodes [m²], shape (n,), the wall is moved by up to 0.02 spacings to where a uniform pressure has no moment.
+    """
+    j, near = jnp.arange(grid.shape[axis], dtype=jnp.int32), 1e-3  # what is as near to ½ or −¼ counts as there
+    place = jnp.asarray(position)
+    lattice, length = (j + window[axis]).astype(place.dtype), len(j) * grid.spacing
+    first = lattice[0] * grid.spacing
+    place = jnp.clip(place, first - length, first + 2 * length)  # a wall that is none is infinitely far
+    before = inward * (lattice - place / grid.spacing)
+    free = before > max(order - 1, 1) / 2 - near
+    base = jnp.argmin(jnp.where(free, before, jnp.inf)).astype(j.dtype)
+    source = jnp.where(before > -0.25 - near, j, base)
+    if slope is not None:
+        others = tuple(k for k in range(grid.dim + 1) if k != axis + 1)
+        force = jnp.where(free & (j != base), 0, slope.reshape(grid.layers, *grid.shape).sum(others))
+        total = force.sum()
+        middle = jnp.where(total == 0, 0, (force * before).sum() / jnp.where(total == 0, 1, total))
+        before = before - jnp.clip(middle, -0.02, 0.02)
+    odd = jnp.where(free, 1, before / jnp.where(free[base], before[base], 1))
+    return Image(grid.shape, grid.layers, axis, source, jnp.ones_like(j), odd, base=base)
