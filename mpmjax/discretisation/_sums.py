@@ -224,7 +224,11 @@ def scatter_change(
     every, amounts = tuple(group for group, _ in some), [da for _, da in some]
     if not is_zero(dt):
         every, amounts = (*_moved(groups), *every), [dt, *rows, *amounts]
-    return [scatter_sum(first, t, *amounts, groups=every, **params)] if every else []
+    if not every:
+        return []
+    (change,) = scatter_sum(first, t, *amounts, groups=every, **params)
+    lacking = max(a.shape[-2] for a in rows) - change.shape[-1]  # columns that nothing which changes has
+    return [[jnp.pad(change, [(0, 0)] * (change.ndim - 1) + [(0, lacking)])]]
 
 
 def _scatter_jvp(primals: tuple, tangents: tuple, *, groups: Groups, **params: Any) -> tuple:
