@@ -347,9 +347,7 @@ def test_a_verdict_is_given_beyond_rounding_only():
     nodes = in_touch(FLOORS["mirrored"](0.0))
     (contact,) = nodes.contacts
     mass = np.asarray(nodes.mass)
-    met = np.asarray(contact.image.along(contact.before == 0)) & (
-        mass > 0
-    )  # columns are seen at their node on the plane
+    met = np.asarray(contact.image.along(contact.image.odd == 0)) & (mass > 0)  # columns by their node on the plane
     weight = np.asarray(contact.image.column(contact._weight(nodes.mass)))
 
     def found(held, share):
@@ -404,7 +402,7 @@ def test_an_active_set_that_does_not_settle_is_given_up_after_four_sweeps():
     new = update(pulled, Stubborn())
     assert new.contact.sweeps == SWEEPS == 4
     (contact,) = nodes.contacts
-    columns = contact.image.along(contact.before == 0) & (nodes.mass > 0)
+    columns = contact.image.along(contact.image.odd == 0) & (nodes.mass > 0)
     assert int(new.contact.violations) == int(columns.sum()) > 3
 
 

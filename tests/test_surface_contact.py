@@ -357,7 +357,7 @@ def test_what_flows_stays_in_its_vessel_when_it_is_let_down(law, kind, d, at, pe
     ("law", "d", "at", "times"),
     [
         ("fluid", 2, 0.0, 9.0),
-        *thorough(*(("fluid", 2, at, times) for at in (0.1, 0.25, 0.5) for times in (0.7, 9.0))),
+        *thorough(*(("fluid", 2, at, times) for at in (0.1, 0.25, 0.5) for times in (2.0, 9.0))),
         *thorough(("fluid_in_tension", 2, 0.1, 9.0), ("viscous_fluid", 2, 0.1, 9.0), ("fluid", 3, 0.1, 9.0)),
     ],
 )
@@ -374,8 +374,8 @@ def test_a_fluid_at_rest_between_walls_stays_at_rest(law, d, at, times):
     walls, gravity = mpm.SeparatingBox(lower, (*upper, INF)), (0.0,) * (d - 1) + (-load / (1e3 * deep),)
     scene = mpm.Scene(grid, ALL_LAWS[law], boundary=walls, gravity=gravity)
     dt = times * float(mpm.stable_dt(mpm.Scene(grid, mpm.Fluid(modulus)), body, safety=1.0))
-    method = mpm.Explicit() if times < 1 else mpm.SemiImplicit()
-    final = mpm.rollout(scene, mpm.prepare(scene, body), steps=round(170 / times), dt=dt, method=method)
+    steps = round(170 / times)
+    final = mpm.rollout(scene, mpm.prepare(scene, body), steps=steps, dt=dt, method=mpm.SemiImplicit())
     height = final.x[:, -1] - low
     assert_close(height.mean(), (body.x[:, -1] - low).mean(), 5e-3)
     off = -scene.laws[0].elastic(None).stress(final.F) / load - (1 - height / deep)
@@ -384,12 +384,12 @@ def test_a_fluid_at_rest_between_walls_stays_at_rest(law, d, at, times):
 
 @pytest.mark.thorough
 def test_a_fluid_thrown_at_its_own_speed_of_sound_stays_in_its_vessel():
-    """In steps of 0.16 dx/c."""
+    """In steps of 0.03 dx/c."""
     dx, c = 0.1, 10.0
     grid = mpm.Grid((14, 14), dx, origin=(-4, -4))
     fluid = mpm.fill(mpm.Box((0.1, 0.04), (0.5, 0.44)), grid, density=1e3, velocity=(0.0, -c))
     scene = mpm.Scene(grid, mpm.Fluid(1e5), boundary=mpm.SeparatingBox((0.0, 0.0), (0.6, 0.9)))
-    run = mpm.simulate(scene, fluid, t1=0.0592, dt=0.16 * dx / c, observe=lambda _, now: now.x[:, 1].min())
+    run = mpm.simulate(scene, fluid, t1=0.045, dt=0.03 * dx / c, observe=lambda _, now: now.x[:, 1].min())
     assert float(run.observed.min()) > 0
 
 

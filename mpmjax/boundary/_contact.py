@@ -269,6 +269,8 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         of the last one is at right angles to all others: along it, the residual is the last one's impulse alone, times
         the length of its part.
         """
+        if not self.nodes.free_normals:
+            return ()
         parts, left = [], self.images.fold(residual)
         for part in reversed(self.nodes.free_normals):
             impulse = ((part.direction * left).sum(axis=1) / part.length)[:, None] * part.normal

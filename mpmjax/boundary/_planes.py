@@ -313,23 +313,23 @@ class ContactPlane(AbstractPlane):
         distance = self.inward * (faces.x[:, self.axis] - self.position)
         landing = surface_contact(Surface(distance, normal, self.friction, axis=self.axis), faces)
         shut = landing.gap <= SHUT * faces.spacing
-        plane = plane_contact(landing, shut[0], position, self.inward, grid, window)
+        around = scatter(faces.stencil, shut.astype(faces.stencil.offset.dtype), None, grid.size)[:, 0]
+        plane = plane_contact(landing, around, position, self.inward, grid, window)
         return (plane,) if faces.explicit else (replace(landing, beside=~shut), plane)
 
 
 def plane_contact(
     surface: SurfaceContact,
-    shut: Bool[Array, "p"],
+    around: NodeScalar,
     position: Scalar,
     inward: int,
     grid: Grid,
     window: Int[Array, "d"],
     slope: NodeScalar | None = None,
 ) -> PlaneContact:
-    """The contact of a wall across the axis of a surface, at a coordinate [m], with the columns that the particles
-    reach whose gap is shut (see `wall_image`)."""
+    """The contact of a wall across the axis of a surface, at a coordinate [m], with the columns `around` particles
+    whose gap is shut, where their weights have a sum, shape (n,). For `slope` see `wall_image`."""
     stencil, axis = surface.faces.stencil, surface.axis
     assert axis is not None
     image = wall_image(axis, position, inward, grid, window, len(stencil.basis.knots) - 1, slope)
-    around = scatter(stencil, shut[None].astype(stencil.offset.dtype), None, grid.size)
-    return PlaneContact(image, inward, surface.coefficient, image.column(around[:, 0]) > 0)
+    return PlaneContact(image, inward, surface.coefficient, image.column(around) > 0)

@@ -145,7 +145,7 @@ class Image(eqx.Module):
         blocks = field.reshape(self.layers, *self.shape, -1)
         by_axis = [1] * blocks.ndim
         by_axis[self.axis + 1], by_axis[-1] = sign.shape
-        copied = jnp.take(blocks, source, axis=self.axis + 1) * sign.reshape(by_axis).astype(field.dtype)
+        copied = jnp.take(blocks, source, axis=self.axis + 1, mode="clip") * sign.reshape(by_axis).astype(field.dtype)
         copied = copied.reshape(field.shape)
         return copied if self.held is None else jnp.where(self.held[:, None], copied, field)
 
