@@ -219,7 +219,8 @@ def test_what_has_no_image_in_the_window_is_still(keep):
 
 @pytest.mark.thorough
 def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():
-    """Two planes that meet, with random columns of either: every node is itself or a signed copy; no mass is lost."""
+    """Two planes that meet, with random columns of either: every node is itself or follows one; no mass is lost.
+    Behind the walls B = ξ/ξ_b is negative, on them it is zero."""
     grid, rng = mpm.Grid((7, 6), DX), np.random.default_rng(0)
     planes = (mpm.ContactPlane(0, 0.2), mpm.ContactPlane(1, 0.35, "below"))
     columns = [np.broadcast_to(rng.random((1, 6)) < 0.5, (7, 6)), np.broadcast_to(rng.random((7, 1)) < 0.5, (7, 6))]
@@ -230,7 +231,7 @@ def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():
     B, transpose = (np.asarray(jax.vmap(f)(basis)).reshape(84, 84).T for f in (images.unfold, images.fold))
     np.testing.assert_array_equal(B.T, transpose)
     assert ((B != 0).sum(axis=1) <= 1).all()
-    assert set(np.unique(B)) == {-1, 0, 1}
+    assert set(np.unique(B.round(12))) == {-3, -2, -1, 0, 1}
     free = ~columns[0] & ~columns[1]
     np.testing.assert_array_equal(B[np.repeat(free.ravel(), 2)], np.eye(84)[np.repeat(free.ravel(), 2)])
     mass = jnp.asarray(rng.random(42))

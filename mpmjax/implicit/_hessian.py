@@ -226,11 +226,11 @@ class JvpHessian(AbstractHessian):
     """The Hessian by `jax.jvp` of the gradient of each law's energy. It needs only the energy of a law."""
 
     def at(self, potential: ElasticPotential, u: NodeVector | None) -> TangentAction:
-        def differential(law: AbstractMaterial, F: Deformation) -> Callable[[Deformation], Deformation]:
-            stress = jax.grad(lambda F: law.energy(F).sum())
-            return lambda dF: jax.jvp(stress, (F,), (dF,))[1]
+        def differential(law: AbstractMaterial, F: Deformation, dF: Deformation) -> Deformation:
+            return jax.jvp(jax.grad(lambda F: law.energy(F).sum()), (F,), (dF,))[1]
 
-        return _tangents_of(potential, u, differential)
+        # no closure: the rule of a solve takes its problem as a tree of arrays
+        return _tangents_of(potential, u, lambda law, F: eqx.Partial(differential, law, F))
 
 
 def _tangents_of(
