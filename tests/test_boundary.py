@@ -10,7 +10,7 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax.boundary import combined_conditions, mirror
-from mpmjax.potential import Mirror
+from mpmjax.potential import Mirror, wall_image
 
 TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {
@@ -222,11 +222,10 @@ def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():
     """Two planes that meet, with random columns of either: every node is itself or follows one; no mass is lost.
     Behind the walls B = ξ/ξ_b is negative, on them it is zero."""
     grid, rng = mpm.Grid((7, 6), DX), np.random.default_rng(0)
-    planes = (mpm.ContactPlane(0, 0.2), mpm.ContactPlane(1, 0.35, "below"))
     columns = [np.broadcast_to(rng.random((1, 6)) < 0.5, (7, 6)), np.broadcast_to(rng.random((7, 1)) < 0.5, (7, 6))]
     window = grid.window(jnp.zeros((1, 2)))
-    found = [contact for plane in planes for contact in plane.contacts(None, grid, window, 0.0, DT)]
-    images = Mirror(tuple(c.image.within(jnp.asarray(h.ravel())) for c, h in zip(found, columns, strict=True)))
+    walls = [wall_image(0, 0.2, 1, grid, window, order=2), wall_image(1, 0.35, -1, grid, window, order=2)]
+    images = Mirror(tuple(w.within(jnp.asarray(h.ravel())) for w, h in zip(walls, columns, strict=True)))
     basis = jnp.eye(84).reshape(84, 42, 2)
     B, transpose = (np.asarray(jax.vmap(f)(basis)).reshape(84, 84).T for f in (images.unfold, images.fold))
     np.testing.assert_array_equal(B.T, transpose)

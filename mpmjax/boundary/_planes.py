@@ -180,8 +180,8 @@ class PlaneContact(AbstractContact):
     """The inward normal's component: +1 or −1."""
     coefficient: Scalar
     """Coulomb coefficient [-]."""
-    shut: Bool[Array, "n"] | None = None
-    """The columns that may be held, shape (n,); None for all."""
+    shut: Bool[Array, "n"]
+    """The columns that may be held, shape (n,)."""
 
     @property
     def mirror_image(self) -> Image:
@@ -192,7 +192,7 @@ class PlaneContact(AbstractContact):
         the map's."""
         lacking = (v - self.image.vector(v))[:, self.image.axis]
         columns = self.inward * self.image.column(self._weight(held.unconstrained.mass) * lacking)
-        return self._tied(held, columns if self.shut is None else jnp.where(self.shut, columns, 0))
+        return self._tied(held, jnp.where(self.shut, columns, 0))
 
     def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
         """The normal impulse of each column [kg m/s]."""
@@ -306,9 +306,7 @@ class ContactPlane(AbstractPlane):
         behind it."""
         del t, dt
         position = jax.lax.stop_gradient(self.position)  # the lattice goes with it
-        if faces is None:
-            image = wall_image(self.axis, position, self.inward, grid, window, 2)
-            return (PlaneContact(image, self.inward, self.friction),)
+        assert faces is not None  # as it `sees_faces`
         normal = jnp.zeros_like(faces.x.T).at[self.axis].set(self.inward)
         distance = self.inward * (faces.x[:, self.axis] - self.position)
         landing = surface_contact(Surface(distance, normal, self.friction, axis=self.axis), faces)
