@@ -197,7 +197,7 @@ class SeparatingBox(AbstractBox):
     ) -> tuple[AbstractContact, ...]:
         """Springs, and in implicit steps, for what flows, two walls an axis that hold the columns of nodes whose gap is
         shut; as at a `ContactPlane` springs push it in the step that would bring its faces behind a wall. Explicit
-        steps, which are as short as the springs need, would take ten times as long by such walls."""
+        steps, which are as short as the springs need, would take several times as long by such walls."""
         assert faces is not None  # as it `pushes`
         surfaces = tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
         if faces.explicit or not any(shape.flows for shape in faces.shapes):
