@@ -15,8 +15,7 @@ from mpmjax._types import components
 from mpmjax.boundary import mirror
 from mpmjax.discretisation._transfer import p2g
 from mpmjax.implicit import DiagonalInnerProduct, ElasticPotential, ImplicitOperator, Projection
-from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, Iterate, _outcome
-from mpmjax.implicit._linear_solve import NEARLY_CONVERGED
+from mpmjax.implicit._solver import NEARLY_CONVERGED, NEGLIGIBLE_CHANGE, Iterate, _outcome
 
 N = 24
 DTYPES = {"float64": jnp.float64, "float32": jnp.float32}

@@ -15,7 +15,7 @@ from mpmjax.autodiff._rule import _values
 from mpmjax.boundary._contact import ConstrainedNodes
 from mpmjax.checks._values import canonical
 from mpmjax.implicit import Projection
-from mpmjax.implicit._conjugate_residual import _solve
+from mpmjax.implicit._solver import _solve
 from mpmjax.simulation._diffrax import Problem, SegmentAdjoint
 from mpmjax.state import state_of
 from mpmjax.stepping._nodes import Nodes

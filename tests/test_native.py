@@ -19,8 +19,8 @@ import mpmjax as mpm
 from mpmjax.discretisation import Stencil, _fused_sums, _sums as sums, basis_attributes, make_stencil
 from mpmjax.discretisation._basis import basis_of
 from mpmjax.discretisation._sums import Group
-from mpmjax.implicit import ImplicitOperator, ParticleStiffness, Projection, _conjugate_residual as residuals
-from mpmjax.implicit._operator import rest_of_product
+from mpmjax.implicit import ImplicitOperator, ParticleStiffness, Projection, _solver as solver
+from mpmjax.implicit._operator import active_blocks, combine_onto, rest_of_product
 from mpmjax.native import _library
 from mpmjax.potential import Mirror
 
@@ -295,9 +295,9 @@ def test_combined_vectors_agree(choose):
 
     def combined(onto):
         def of(a, b, c, d, weight, s):
-            active = residuals.active_blocks(a != 0, b != 0, c != 0, d != 0)
+            active = active_blocks(a != 0, b != 0, c != 0, d != 0)
             assert active.shape == (16,)
-            return tuple(residuals.combine_onto[onto](a, b, c, d, jnp.stack([s, t]), weight, active))
+            return tuple(combine_onto[onto](a, b, c, d, jnp.stack([s, t]), weight, active))
 
         return of
 
@@ -329,7 +329,7 @@ def test_products_of_vectors_agree(choose, each):
     some, free = jnp.asarray(some), jnp.asarray(free)
 
     def agreeing(*args):
-        return tuple(rest_of_product(*args[:4], free, args[4], residuals.active_blocks(some)))
+        return tuple(rest_of_product(*args[:4], free, args[4], active_blocks(some)))
 
     def expected(force, v, mass, factor, weight):
         image = jnp.where(free, jnp.repeat(mass, each) * v + factor * jnp.where(free, force, 0), v)
@@ -357,14 +357,13 @@ def test_solves_agree(choose, d):
     upper = jnp.asarray(np.where((row == column)[:, None], 2.0, 0.1) * np.ones((len(upper), 30)))
     mass, free = jnp.asarray(rng.uniform(1, 2, len(u))), jnp.asarray(rng.uniform(size=size) < 0.7)
     r, weight = jnp.where(free, jnp.asarray(rng.normal(size=size)), 0), jnp.asarray(rng.uniform(1, 2, size))
-    active = residuals.active_blocks(free)
+    active = active_blocks(free)
 
     def run(factor, steps, r, rtol, far):
         stencil = Stencil(first, t, jnp.asarray(1.0), first[0] >= 0, basis_for(d, 3, side=8))
         stiffness = ParticleStiffness(upper, stencil, Mirror(()))
         matrices = ImplicitOperator(mass, factor, stiffness, Projection(free.reshape(u.shape)))
-        space = residuals._DiagonalSpace(matrices.product, weight, active)
-        return residuals.solve_particle_matrices(matrices, space, r, far * x, rtol, steps)
+        return solver.solve_particle_matrices(matrices, weight, active, r, far * x, rtol, steps)
 
     x = jnp.where(free, jnp.asarray(rng.normal(size=size)), 0)
     given = (

@@ -4,7 +4,6 @@ Choices of a method: `ConjugateResidual`, `Linearised`, `Newton`; `AnalyticHessi
 `DiagonalPreconditioner`, `MassPreconditioner`; `Guess`. The bases to derive from are called `Abstract...`.
 """
 
-from mpmjax.implicit._conjugate_residual import ConjugateResidual as ConjugateResidual
 from mpmjax.implicit._hessian import (
     AbstractHessian as AbstractHessian,
     AbstractHessianAction as AbstractHessianAction,
@@ -14,20 +13,24 @@ from mpmjax.implicit._hessian import (
     ParticleStiffness as ParticleStiffness,
     TangentAction as TangentAction,
 )
-from mpmjax.implicit._linear_solve import (
+from mpmjax.implicit._newton import Newton as Newton
+from mpmjax.implicit._operator import (
     AbstractInnerProduct as AbstractInnerProduct,
-    AbstractInnerProductSolver as AbstractInnerProductSolver,
     AbstractPreconditioner as AbstractPreconditioner,
     DiagonalInnerProduct as DiagonalInnerProduct,
     DiagonalPreconditioner as DiagonalPreconditioner,
+    ImplicitOperator as ImplicitOperator,
     MassPreconditioner as MassPreconditioner,
+    Projection as Projection,
+)
+from mpmjax.implicit._potential import ElasticPotential as ElasticPotential
+from mpmjax.implicit._solve_info import (
+    AbstractInnerProductSolver as AbstractInnerProductSolver,
     SolveInfo as SolveInfo,
     no_solve as no_solve,
     require_solver as require_solver,
 )
-from mpmjax.implicit._newton import Newton as Newton
-from mpmjax.implicit._operator import ImplicitOperator as ImplicitOperator, Projection as Projection
-from mpmjax.implicit._potential import ElasticPotential as ElasticPotential
+from mpmjax.implicit._solver import ConjugateResidual as ConjugateResidual
 from mpmjax.implicit._stage import (
     AbstractStageSolver as AbstractStageSolver,
     Guess as Guess,

@@ -10,8 +10,8 @@ import lineax as lx
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
 from mpmjax.checks import require, require_fields, require_tolerance
-from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, ConjugateResidual
-from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, SolveInfo, default_rtol, require_solver, solve_linear
+from mpmjax.implicit._solve_info import SolveInfo, require_solver
+from mpmjax.implicit._solver import DEFAULT_RTOL, NEARLY_CONVERGED, NEGLIGIBLE_CHANGE, ConjugateResidual, solve_linear
 from mpmjax.implicit._stage import AbstractStageSolver, StageProblem
 
 MOST_HALVINGS = 30
@@ -65,7 +65,7 @@ class Newton(AbstractStageSolver):
         require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")
 
     def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
-        rtol = default_rtol(guess.dtype) if self.rtol is None else self.rtol
+        rtol = DEFAULT_RTOL[guess.dtype.itemsize] if self.rtol is None else self.rtol
         combine, free, potential = problem.projection.combine, problem.projection.free, problem.incremental_potential
         mass = jnp.where(free, problem.mass[:, None], 1)  # the weight of the norms in the termination rule
         unit, rounding_unit = problem.unit_strain_velocity(), _ROUNDING * jnp.finfo(guess.dtype).eps

@@ -1,8 +1,9 @@
-"""The matrix of implicit solves, M + χH on free components."""
+"""The matrix of implicit solves, M + χH on free components, and its preconditioners."""
 
+import abc
 from collections.abc import Sequence
 from functools import reduce
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -12,6 +13,8 @@ import numpy as np
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.implicit._hessian import AbstractHessianAction, ParticleStiffness
 from mpmjax.native import NativeFunction
+
+_BLOCK_SIZE = 64  # as in native/vectors.h
 
 
 class Projection(eqx.Module):
@@ -121,6 +124,104 @@ class ImplicitOperator(eqx.Module):
         return columns(jnp.eye(vector.size, dtype=vector.dtype)).T
 
 
+class AbstractInnerProduct(eqx.Module):
+    """The inner product ⟨a, b⟩ = aᵀ W b with a symmetric positive definite W = L Lᵀ.
+
+    W is a preconditioner of a symmetric A: W⁻¹A is self-adjoint in this inner product, and the number of iterations
+    grows with the spread of its eigenvalues. `ConjugateResidual` works on W⁻¹A. Any other solver is given L⁻¹A L⁻ᵀ,
+    which has the same eigenvalues and is symmetric in the plain inner product.
+
+    The W of an `ImplicitOperator` must commute with its projection Q, W = Q W Q + (I − Q) W (I − Q), so that residuals
+    and steps have no part in held components.
+    """
+
+    @abc.abstractmethod
+    def apply(self, v: Any) -> Any:
+        """W v."""
+
+    @abc.abstractmethod
+    def solve_factor(self, r: Any) -> Any:
+        """L⁻¹ r."""
+
+    @abc.abstractmethod
+    def solve_factor_transpose(self, v: Any) -> Any:
+        """L⁻ᵀ v."""
+
+    def solve(self, r: Any) -> Any:
+        """W⁻¹ r."""
+        return self.solve_factor_transpose(self.solve_factor(r))
+
+    def factored(self) -> "AbstractInnerProduct":
+        """The inner product for solvers that need L: this one, if it has the factor."""
+        return self
+
+
+class DiagonalInnerProduct(AbstractInnerProduct):
+    """The inner product of a diagonal W.
+
+    Args:
+        weight: the positive diagonal, of the structure of a vector.
+    """
+
+    weight: Any
+
+    def apply(self, v: Any) -> Any:
+        return jax.tree.map(jnp.multiply, self.weight, v)
+
+    def solve_factor(self, r: Any) -> Any:
+        return jax.tree.map(lambda r, w: r / jnp.sqrt(w), r, self.weight)
+
+    def solve_factor_transpose(self, v: Any) -> Any:
+        return self.solve_factor(v)
+
+    def solve(self, r: Any) -> Any:
+        return jax.tree.map(jnp.divide, r, self.weight)
+
+
+class AbstractPreconditioner(eqx.Module):
+    """A symmetric positive definite approximation W of M + χH that is easily inverted.
+
+    The number of iterations grows with the spread of the eigenvalues of W⁻¹(M + χH). The tolerance of a solve is that
+    of its residual in the norm of W⁻¹. Subclass it for a preconditioner of your own.
+    """
+
+    advice: ClassVar[str | None] = None
+    """The remedy where solves do not converge, as words that follow "or"; None if nothing better is known."""
+
+    @abc.abstractmethod
+    def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
+        """The inner product of W. W must commute with the operator's projection; for a diagonal,
+        `operator.projection.commuting_weight` makes it so."""
+
+
+class DiagonalPreconditioner(AbstractPreconditioner):
+    """M + χ diag(H) without negative parts of H. The default.
+
+    The saving depends on the scene. In bodies of halves, layers and inclusions at contrasts of 10 to 10 000, in two and
+    three dimensions, it took between an eighth and three fifths of the iterations of `MassPreconditioner` at a hundred
+    times the explicit limit, and between a third and all of them at twenty times. In homogeneous bodies it took between
+    a third of them and a fifth more.
+    """
+
+    def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
+        return DiagonalInnerProduct(operator.projection.commuting_weight(operator.diagonal()))
+
+
+class MassPreconditioner(AbstractPreconditioner):
+    """M: W⁻¹A is then the matrix of eq. 6 of the derivation."""
+
+    advice: ClassVar[str | None] = "take preconditioner=DiagonalPreconditioner(), which needs fewer iterations"
+
+    def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
+        return DiagonalInnerProduct(operator.projection.commuting_weight(operator.nodal_mass()))
+
+
+def active_blocks(*may_differ_from_zero: Bool[Array, "m"]) -> Bool[Array, "k"]:
+    """Whether a block of 64 consecutive numbers may differ from zero, shape (⌈m/64⌉,). Others are skipped."""
+    some = reduce(jnp.logical_or, may_differ_from_zero)
+    return jnp.pad(some, (0, -len(some) % _BLOCK_SIZE)).reshape(-1, _BLOCK_SIZE).any(axis=1)
+
+
 def _product(*args: Array) -> list[Array]:
     """W⁻¹A v and vᵀA v, with (A v)_i = m_i v_i + χ f_i where i is free, f = H v, and v_i elsewhere."""
     force, v, mass, factor, free, weight, _ = args
@@ -140,3 +241,24 @@ rest_of_product = NativeFunction(
 )
 """The rest of a product with M + χH, once H v is known, with an inner product. In JAX these are some four passes over
 the window, of which a body may fill a small part; natively it is one, in place, that skips inactive blocks."""
+
+
+def _combine(a: Array, b: Array, c: Array, d: Array, scales: Array, weight: Array, active: Array) -> list[Array]:
+    """Two sums of two vectors with a norm. In JAX these are some four passes over the window, of which a body may fill
+    a small part; natively it is one, in place, that skips inactive blocks."""
+    del active
+    return [a + scales[0] * b, z := c + scales[1] * d, (weight * z * z).sum()]
+
+
+combine_onto = tuple(
+    NativeFunction(
+        "combine",
+        _combine,
+        lambda *args: [args[0].shape[-1:], args[0].shape[-1:], ()],
+        vectors_fit,
+        aliases={onto: 0, 2 + onto: 1},
+        differentiable=True,
+    )
+    for onto in (0, 1)
+)
+"""`_combine`, its results in the memory of a and c, or of b and d."""

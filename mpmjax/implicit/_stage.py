@@ -18,17 +18,11 @@ import lineax as lx
 from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
 from mpmjax.autodiff import ruled, saved_for_backward, without_derivative
 from mpmjax.checks import require_fields
-from mpmjax.implicit._conjugate_residual import ConjugateResidual
 from mpmjax.implicit._hessian import AbstractHessian, AbstractHessianAction, DampedAction
-from mpmjax.implicit._linear_solve import (
-    AbstractPreconditioner,
-    SolveInfo,
-    default_rtol,
-    require_solver,
-    solve_linear,
-)
-from mpmjax.implicit._operator import ImplicitOperator, Projection
+from mpmjax.implicit._operator import AbstractPreconditioner, ImplicitOperator, Projection
 from mpmjax.implicit._potential import ElasticPotential
+from mpmjax.implicit._solve_info import SolveInfo, require_solver
+from mpmjax.implicit._solver import DEFAULT_RTOL, ConjugateResidual, solve_linear
 
 _DERIVATIVE_RTOL = 1e-6
 """Largest default relative tolerance of tangent and adjoint solves. In float32 it is smaller than that of a step: in
@@ -265,7 +259,7 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
 
     def solve_symmetric(matvec: Any, b: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
         del matvec  # the precomputed operator is the same map and faster
-        rtol = min(default_rtol(b[0].dtype), _DERIVATIVE_RTOL)
+        rtol = min(DEFAULT_RTOL[b[0].dtype.itemsize], _DERIVATIVE_RTOL)
         x, report, _ = solve_linear(adjoint, matrix, b[0], inner, rtol=rtol)
         solved, finite = report.converged | report.nearly_converged, jnp.isfinite(b[0]).all()
         residual = jnp.where(jnp.isfinite(report.residual), report.residual, jnp.inf)

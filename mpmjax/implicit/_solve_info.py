@@ -1,0 +1,84 @@
+"""The interface of linear solvers, and the report of a solve."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import lineax as lx
+
+from mpmjax._types import Array, Bool, Float, Int
+from mpmjax.checks import require_that
+
+
+class SolveInfo(eqx.Module):
+    """Cost and quality of the solution of one step's equations."""
+
+    iterations: Int[Array, "*f"]
+    """Iterations of the linear solver, summed over Newton steps; 0 if the solver states none."""
+    newton: Int[Array, "*f"]
+    """Newton steps."""
+    line_search: Int[Array, "*f"]
+    """Halvings of a Newton step by the line search."""
+    residual: Float[Array, "*f"]
+    """True relative residual at the end. For one linear solve it is in the norm of the inverse preconditioner; for
+    Newton's method in that of the inverse mass, and relative to the momentum of the balanced forces if their sum
+    vanishes."""
+    converged: Bool[Array, "*f"]
+    """Whether the residual is within the solver's tolerance, or at the limit of the precision."""
+    nearly_converged: Bool[Array, "*f"]
+    """Whether it is not, but within ten times the tolerance."""
+    indefinite: Bool[Array, "*f"]
+    """Whether the solver met a direction of negative curvature. M + χH is then indefinite, and may be near singular."""
+    report: Float[Array, "*f"]
+    """Zero. Its tangent is the relative residual of the tangent solves that did not converge (see `Reporting`)."""
+
+    def followed_by(self, later: "SolveInfo") -> "SolveInfo":
+        """The summed cost of two solves of one equation, and the quality of the later one."""
+        return SolveInfo(
+            iterations=self.iterations + later.iterations,
+            newton=self.newton + later.newton,
+            line_search=self.line_search + later.line_search,
+            residual=later.residual,
+            converged=later.converged,
+            nearly_converged=later.nearly_converged,
+            indefinite=self.indefinite | later.indefinite,
+            report=self.report + later.report,
+        )
+
+    def together_with(self, other: "SolveInfo") -> "SolveInfo":
+        """The summed cost of two solves that are both needed, and the quality of the worse one."""
+        both = self.followed_by(other)
+        converged = self.converged & other.converged
+        usable = (self.converged | self.nearly_converged) & (other.converged | other.nearly_converged)
+        worst = jnp.maximum(self.residual, other.residual), converged, usable & ~converged
+        return eqx.tree_at(lambda info: (info.residual, info.converged, info.nearly_converged), both, worst)
+
+
+def no_solve(dtype: Any) -> SolveInfo:
+    """The report of an update without a solve."""
+    count, zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), dtype), jnp.zeros((), bool)
+    return SolveInfo(count, count, count, residual=zero, converged=~no, nearly_converged=no, indefinite=no, report=zero)
+
+
+class AbstractInnerProductSolver(lx.AbstractLinearSolver[Any]):
+    """A symmetric solver that takes an inner product itself.
+
+    `init` is given an `ImplicitOperator`, `compute` the option `inner_product`, an `AbstractInnerProduct`. Its result
+    is successful if it converged. Its statistics are `num_steps`, `residual`, `nearly_converged` and `indefinite` (see
+    `SolveInfo`), and `spectral_radius`, a lower estimate of ‖W⁻¹A‖.
+    """
+
+
+def require_solver(name: str, solver: lx.AbstractLinearSolver) -> None:
+    """Check a linear solver.
+
+    Raises:
+        ValueError: an absolute tolerance that is not above zero.
+    """
+    if (atol := getattr(solver, "atol", None)) is not None:
+        require_that(
+            f"{name} must have an atol above zero, as it compares residuals component by component and those of empty "
+            "nodes are zero (right-hand sides are scaled to norm one, so that it may be as large as rtol)",
+            lambda a: a > 0,
+            atol,
+        )
