@@ -9,7 +9,7 @@ from helpers import DESCRIPTIONS, FLUIDS, LAWS, VISCOUS, assert_close, block, cl
 
 import mpmjax as mpm
 from mpmjax.boundary import mirror
-from mpmjax.implicit import DampedAction, ElasticPotential
+from mpmjax.implicit import ElasticPotential, ImplicitOperator, Projection
 from mpmjax.material import Viscosity
 
 
@@ -54,10 +54,12 @@ CASES = [("viscous_solid", "updated"), *thorough(("viscous_solid", "total"), ("v
 @eqx.filter_jit
 def applied(potential, u, hessian):
     """D u, both powers, and H + 3D through the law and assembled."""
-    action = DampedAction(hessian.at(potential, None), potential, jnp.asarray(3.0))
+    size, d = u.shape[1:]
+    free, viscosity = Projection(jnp.ones((size, d), bool)), (potential, jnp.asarray(3.0))
+    matrix = ImplicitOperator(jnp.zeros(size), 1.0, hessian.at(potential, None), free, viscosity)
     elastic = hessian.at(potential, None)(u[0])
     drags, powers = jax.vmap(potential.viscous_resistance)(u), jax.vmap(potential.power)(u)
-    return drags, powers, elastic, action(u[0]), action.precomputed()(u[0])
+    return drags, powers, elastic, matrix.unconstrained(u[0]), matrix.precomputed().unconstrained(u[0])
 
 
 @pytest.mark.parametrize(("law", "description"), CASES)

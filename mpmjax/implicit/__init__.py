@@ -8,7 +8,6 @@ from mpmjax.implicit._hessian import (
     AbstractHessian as AbstractHessian,
     AbstractHessianAction as AbstractHessianAction,
     AnalyticHessian as AnalyticHessian,
-    DampedAction as DampedAction,
     JvpHessian as JvpHessian,
     ParticleStiffness as ParticleStiffness,
     TangentAction as TangentAction,

@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -14,19 +15,12 @@ from mpmjax.checks import require_fields
 from mpmjax.discretisation import Stencil, resist
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.material import AbstractMaterial
-from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror, added, scattered
+from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror, scattered
 from mpmjax.state import MaterialPoints
-
-Tangents = tuple[Callable[[Deformation], Deformation], ...]
-"""The stress differential δF ↦ δP [Pa] of each material's particles, both of F's shape."""
 
 
 class AbstractHessianAction(eqx.Module):
     """The symmetric linear map δu ↦ H δu [N], H = ∂²Φ/∂u∂u [N/m], on nodal displacements δu [m], shape (n, d)."""
-
-    @abc.abstractmethod
-    def is_positive_semidefinite(self) -> bool:
-        """Whether H is known to be positive semi-definite."""
 
     @abc.abstractmethod
     def __call__(self, du: NodeVector) -> NodeVector:
@@ -56,6 +50,7 @@ class ParticleStiffness(AbstractHessianAction):
     """The stiffness of terms."""
 
     def is_positive_semidefinite(self) -> bool:
+        """Whether H is known to be positive semi-definite."""
         return self.positive_semidefinite and all(part.is_positive_semidefinite() for part in self.others)
 
     def __call__(self, du: NodeVector) -> NodeVector:
@@ -88,12 +83,29 @@ class ParticleStiffness(AbstractHessianAction):
         """
         d = self.stencil.dim
         places = np.cumsum([0, *range(d * d, 1, -1)])  # of the diagonal, row by row
-        elastic = Forces(slopes=jnp.stack([self.upper[m] for m in places]).reshape(d, d, -1))
-        materials = added([elastic, *(part.diagonal(self.stencil, size) for part in self.coupled)]).slopes
-        assert materials is not None
+        elastic = jnp.stack([self.upper[m] for m in places]).reshape(d, d, -1)
+        for part in self.coupled:
+            share = part.diagonal(self.stencil, size).slopes
+            elastic = elastic if share is None else elastic + share
         shares = [part.diagonal(self.stencil, size) for part in self.others]
-        total = scattered([Forces(slopes=jnp.maximum(materials, 0)), *shares], self.stencil.squared, size)
-        return self.mirror.fold_scalars(total)
+        total = scattered([Forces(slopes=jnp.maximum(elastic, 0)), *shares], self.stencil.squared, size)
+        return self.mirror.fold_scalars(total) if self.mirror.images else total
+
+    def damped(self, potential: ElasticPotential, rate: Scalar) -> "ParticleStiffness":
+        """H + r D, with r = `rate` [1/s] and D [N s/m] the positive semi-definite matrix of the potential's viscous
+        force."""
+        upper, d = self.upper, self.stencil.dim
+
+        def damping(points: MaterialPoints) -> Array:
+            def flux_of(slopes: Matrix) -> Matrix:
+                return la.transpose(points.weighted_viscous_stress(la.transpose(slopes)))
+
+            like = jnp.zeros((d, d, *points.volume.shape), points.volume.dtype)
+            return la.upper_triangle(la.matrix_of(flux_of, like))
+
+        if potential.material_viscous:
+            upper = upper + rate * jnp.concatenate([damping(points) for points in potential.material_points], axis=-1)
+        return replace(self, upper=upper, others=tuple(part.damped(rate) for part in self.others))
 
 
 class TangentAction(AbstractHessianAction):
@@ -107,74 +119,36 @@ class TangentAction(AbstractHessianAction):
     """
 
     potential: ElasticPotential
-    tangents: Tangents
+    tangents: tuple[Callable[[Deformation], Deformation], ...]
     positive_semidefinite: bool = eqx.field(static=True, default=False)
     u: NodeVector | None = None
-
-    def is_positive_semidefinite(self) -> bool:
-        return self.positive_semidefinite and all(part.is_positive_semidefinite() for part in self._others())
 
     @eqx.filter_jit  # a law may hold functions
     def __call__(self, du: NodeVector) -> NodeVector:
         """Σ_p V0_p δP_p h_ip, with δP_p = ∂²Ψ/∂F∂F : δF_p (derivation, eqs. 7 and 8), and what terms add."""
         potential, moved = self.potential, self.potential.displaced(du)
-        stress = tuple(tangent(dF) for tangent, dF in zip(self.tangents, potential.change(moved), strict=True))
+        gradient, pairs = (
+            la.transpose(moved.at_particles[1]),
+            zip(potential.material_points, self.tangents, strict=True),
+        )
+        stress = [tangent(points.change(points.rows_of(gradient))) for points, tangent in pairs]
         elastic = Forces(slopes=la.transpose(potential.weighted_stress(stress)))
-        return potential.on_nodes([elastic, *(part(moved) for part in self._others())])
+        at = potential.displaced(self.u)
+        return potential.on_nodes([elastic, *(term.hessian(at)(moved) for term in potential.terms)])
 
     def precomputed(self) -> ParticleStiffness:
         potential, d = self.potential, self.potential.stencil.dim
         pairs = zip(potential.material_points, self.tangents, strict=True)
         upper, coupled = zip(*(points.stiffness(tangent, d) for points, tangent in pairs), strict=True)
+        at = potential.displaced(self.u)
         return ParticleStiffness(
             jnp.concatenate(upper, axis=-1),
             potential.stencil,
             potential.mirror,
             self.positive_semidefinite,
             tuple(part for parts in coupled for part in parts),
-            self._others(),
+            tuple(term.hessian(at) for term in potential.terms),
         )
-
-    def _others(self) -> tuple[AbstractStiffness, ...]:
-        if not self.potential.terms:
-            return ()
-        moved = self.potential.displaced(self.u)
-        return tuple(term.hessian(moved) for term in self.potential.terms)
-
-
-class DampedAction(AbstractHessianAction):
-    """H + r D, with D [N s/m] the positive semi-definite matrix of the viscous force.
-
-    A stage of length Δt_s has r = 1/Δt_s, which gives M + Δt_s D + Δt_s² H.
-    """
-
-    elastic: AbstractHessianAction
-    potential: ElasticPotential
-    rate: Scalar
-
-    def is_positive_semidefinite(self) -> bool:
-        return self.elastic.is_positive_semidefinite()
-
-    def __call__(self, du: NodeVector) -> NodeVector:
-        """(H + r D) δu."""
-        return self.elastic(du) + self.rate * self.potential.viscous_resistance(du)
-
-    def precomputed(self) -> ParticleStiffness:
-        stiffness, d = self.elastic.precomputed(), self.potential.stencil.dim
-
-        def damping(points: MaterialPoints) -> Array:
-            def flux_of(slopes: Matrix) -> Matrix:
-                return la.transpose(points.weighted_viscous_stress(la.transpose(slopes)))
-
-            like = jnp.zeros((d, d, *points.volume.shape), points.volume.dtype)
-            return la.upper_triangle(la.matrix_of(flux_of, like))
-
-        upper = stiffness.upper
-        if self.potential.material_viscous:
-            parts = [damping(points) for points in self.potential.material_points]
-            upper = upper + self.rate * jnp.concatenate(parts, axis=-1)
-        others = tuple(part.damped(self.rate) for part in stiffness.others)
-        return eqx.tree_at(lambda s: (s.upper, s.others), stiffness, (upper, others))
 
 
 class AbstractHessian(eqx.Module):
@@ -214,9 +188,12 @@ class AnalyticHessian(AbstractHessian):
         require_fields(self)
 
     def at(self, potential: ElasticPotential, u: NodeVector | None) -> TangentAction:
-        if self.projected:
-            return _tangents_of(potential, u, lambda law, F: law.projected_differential(F), definite=True)
-        return _tangents_of(potential, u, lambda law, F: law.stress_differential(F))
+        def of_law(law: AbstractMaterial, F: Deformation) -> Callable[[Deformation], Deformation]:
+            return law.projected_differential(F) if self.projected else law.stress_differential(F)
+
+        pairs = zip(potential.material_points, potential.deformation(u), strict=True)
+        tangents = tuple(points.stress_differential(F, of_law, definite=self.projected) for points, F in pairs)
+        return TangentAction(potential, tangents, self.projected, u)
 
     def exact(self) -> "AnalyticHessian":
         return AnalyticHessian() if self.projected else self
@@ -230,17 +207,7 @@ class JvpHessian(AbstractHessian):
             return jax.jvp(jax.grad(lambda F: law.energy(F).sum()), (F,), (dF,))[1]
 
         # no closure: the rule of a solve takes its problem as a tree of arrays
-        return _tangents_of(potential, u, lambda law, F: eqx.Partial(differential, law, F))
-
-
-def _tangents_of(
-    potential: ElasticPotential,
-    u: NodeVector | None,
-    of_law: Callable[[AbstractMaterial, Deformation], Callable[[Deformation], Deformation]],
-    *,
-    definite: bool = False,
-) -> TangentAction:
-    """H at a displacement [m], shape (n, d), by the stress differential of each law; None for no displacement."""
-    pairs = zip(potential.material_points, potential.deformation(u), strict=True)
-    tangents = tuple(points.stress_differential(F, of_law, definite=definite) for points, F in pairs)
-    return TangentAction(potential, tangents, definite, u)
+        of_law = lambda law, F: eqx.Partial(differential, law, F)  # noqa: E731
+        pairs = zip(potential.material_points, potential.deformation(u), strict=True)
+        tangents = tuple(points.stress_differential(F, of_law) for points, F in pairs)
+        return TangentAction(potential, tangents, u=u)

@@ -68,7 +68,13 @@ class Newton(AbstractStageSolver):
         rtol = DEFAULT_RTOL[guess.dtype.itemsize] if self.rtol is None else self.rtol
         combine, free, potential = problem.projection.combine, problem.projection.free, problem.incremental_potential
         mass = jnp.where(free, problem.mass[:, None], 1)  # the weight of the norms in the termination rule
-        unit, rounding_unit = problem.unit_strain_velocity(), _ROUNDING * jnp.finfo(guess.dtype).eps
+        # The velocity w = dx/(θΔt_s) strains a cell by one in the stage. Deformation gradients are of order one, and
+        # rounded to ε, at the smallest strains too: with A the diagonal of the operator, ε A w is the rounding of the
+        # momentum residual and ε A w² that of the potential.
+        unit, rounding_unit = (
+            problem.spacing / (problem.theta * problem.stage_dt),
+            _ROUNDING * jnp.finfo(guess.dtype).eps,
+        )
 
         def norm(r: NodeVector) -> Float[Array, ""]:
             """‖r‖ in the norm of the inverse mass."""

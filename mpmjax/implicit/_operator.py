@@ -12,6 +12,7 @@ import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.implicit._hessian import AbstractHessianAction, ParticleStiffness
+from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.native import NativeFunction
 
 _BLOCK_SIZE = 64  # as in native/vectors.h
@@ -68,10 +69,17 @@ class ImplicitOperator(eqx.Module):
     hessian: AbstractHessianAction
     """H [N/m]."""
     projection: Projection
+    viscosity: tuple[ElasticPotential, Scalar] | None = None
+    """The potential whose viscous force −D v is in the equation, and r [1/s]: H is then H + r D. None if there is no
+    such force, or if `hessian` has it already."""
 
     def unconstrained(self, v: NodeVector) -> NodeVector:
         """(M + χ H) v."""
-        return self.mass[:, None] * v + self.factor * self.hessian(v)
+        force = self.hessian(v)
+        if self.viscosity is not None:
+            potential, rate = self.viscosity
+            force = force + rate * potential.viscous_resistance(v)
+        return self.mass[:, None] * v + self.factor * force
 
     def mv(self, vector: NodeVector) -> NodeVector:
         """A v."""
@@ -87,7 +95,7 @@ class ImplicitOperator(eqx.Module):
             active: `active_blocks`. Elsewhere u is zero and nothing is free.
         """
         v, free = u.reshape(self.projection.free.shape), self.projection.free.reshape(-1)
-        if self.projection.normals:
+        if self.projection.normals or self.viscosity is not None:
             image = self.mv(v).reshape(-1)
             return image / weight, (u * image).sum()
         force, factor = self.hessian(self.projection.combine(v, 0)).reshape(-1), jnp.asarray(self.factor, u.dtype)
@@ -99,11 +107,15 @@ class ImplicitOperator(eqx.Module):
         H = self.hessian
         if not isinstance(H, ParticleStiffness) or H.stencil.own_derivatives is not None:
             return False
-        return not (H.mirror.images or H.coupled or H.others or self.projection.normals)
+        return not (H.mirror.images or H.coupled or H.others or self.projection.normals or self.viscosity is not None)
 
     def precomputed(self) -> "ImplicitOperator":
         """The operator, with H as one matrix for each particle, computed once for many applications."""
-        return ImplicitOperator(self.mass, self.factor, self.hessian.precomputed(), self.projection)
+        if isinstance(self.hessian, ParticleStiffness) and self.viscosity is None:
+            return self
+        stiffness = self.hessian.precomputed()
+        stiffness = stiffness if self.viscosity is None else stiffness.damped(*self.viscosity)
+        return ImplicitOperator(self.mass, self.factor, stiffness, self.projection)
 
     def nodal_mass(self) -> NodeVector:
         """m_i [kg] in each component, shape (n, d)."""
@@ -111,7 +123,9 @@ class ImplicitOperator(eqx.Module):
 
     def diagonal(self) -> NodeVector:
         """m_i + χ H_ii [kg], shape (n, d), without negative parts of H (see `ParticleStiffness.diagonal`)."""
-        return self.mass[:, None] + self.factor * self.hessian.precomputed().diagonal(len(self.mass))
+        stiffness = self.precomputed().hessian
+        assert isinstance(stiffness, ParticleStiffness)
+        return self.mass[:, None] + self.factor * stiffness.diagonal(len(self.mass))
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
         """Shape and dtype of a vector."""

@@ -40,24 +40,21 @@ class ElasticPotential(eqx.Module):
 
     def displaced(self, u: NodeVector | None) -> Displacement:
         """A displacement or velocity of the nodes, shape (n, d), with that of their mirror images; None for zero."""
-        return Displacement(self.stencil, self.size, None if u is None else self.mirror.unfold(u))
+        unfolded = u if u is None or not self.mirror.images else self.mirror.unfold(u)
+        return Displacement(self.stencil, self.size, unfolded)
 
     def on_nodes(self, forces: Sequence[Forces]) -> NodeVector:
         """The sum of forces on the nodes [N], shape (n, d)."""
-        return self.mirror.fold(scattered(forces, self.stencil, self.size))
-
-    def change(self, moved: Displacement) -> Deformations:
-        """δF_p by a displacement, one array for each material."""
-        gradient = la.transpose(moved.at_particles[1])
-        return tuple(points.change(points.rows_of(gradient)) for points in self.material_points)
+        total = scattered(forces, self.stencil, self.size)
+        return self.mirror.fold(total) if self.mirror.images else total
 
     def deformation(self, u: NodeVector | Displacement | None) -> Deformations:
         """F_p + Σ_i u_i h_ipᵀ at a displacement u [m], shape (n, d), one array for each material; None for u = 0."""
-        current = tuple(points.deformation for points in self.material_points)
         moved = u if isinstance(u, Displacement) else self.displaced(u)
         if moved.at_rest:
-            return current
-        return tuple(F + dF for F, dF in zip(current, self.change(moved), strict=True))
+            return tuple(points.deformation for points in self.material_points)
+        gradient = la.transpose(moved.at_particles[1])
+        return tuple(points.deformation + points.change(points.rows_of(gradient)) for points in self.material_points)
 
     def energy(self, u: NodeVector | Displacement) -> Float[Array, ""]:
         """Φ(u) [J]."""

@@ -354,7 +354,8 @@ def solve_linear(
         info = SolveInfo(stats["num_steps"], none, none, stats["residual"], *quality, jnp.zeros_like(stats["residual"]))
         return x, info, stats["spectral_radius"]
 
-    name, inner, definite = type(solver).__name__, inner.factored(), operator.hessian.is_positive_semidefinite()
+    name, inner, stiffness = type(solver).__name__, inner.factored(), operator.hessian
+    definite = isinstance(stiffness, ParticleStiffness) and stiffness.is_positive_semidefinite()
     b = inner.solve_factor(rhs)
     size = jnp.sqrt((b**2).sum())
     size = jnp.where(size == 0, 1, size)

@@ -7,7 +7,6 @@ in reverse mode its transpose (eq. 31): one more solve with the same operator. I
 import abc
 import enum
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -18,7 +17,7 @@ import lineax as lx
 from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
 from mpmjax.autodiff import ruled, saved_for_backward, without_derivative
 from mpmjax.checks import require_fields
-from mpmjax.implicit._hessian import AbstractHessian, AbstractHessianAction, DampedAction
+from mpmjax.implicit._hessian import AbstractHessian, AbstractHessianAction
 from mpmjax.implicit._operator import AbstractPreconditioner, ImplicitOperator, Projection
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._solve_info import SolveInfo, require_solver
@@ -82,16 +81,6 @@ class StageProblem(eqx.Module):
     action: AbstractHessianAction | None = None
     """H at the start of the step in a linearised problem; None in others."""
 
-    def linearised(self) -> "StageProblem":
-        """The problem with f(u) = f(0) − H u."""
-        action, u = self.hessian.at(self.potential, None), self.initial_displacement
-        return replace(self, force=self.force if u is None else self.force - action(u), action=action)
-
-    @property
-    def rhs(self) -> NodeVector:
-        """b = M a + Δt_s (f(0) − H u) [kg m/s] of a linearised problem, shape (n, d)."""
-        return self.mass[:, None] * self.inertial + self.stage_dt * self.force
-
     def operator(self, v: NodeVector, hessian: AbstractHessian | None = None) -> ImplicitOperator:
         """M + θΔt_s D + θΔt_s² H at v, the derivative of `residual`.
 
@@ -102,15 +91,15 @@ class StageProblem(eqx.Module):
         action = self.action
         if action is None:
             action = (hessian or self.hessian.exact()).at(self.potential, self.displacement(v))
-        if self.potential.viscous:
-            action = DampedAction(action, self.potential, 1 / self.stage_dt)
-        return ImplicitOperator(self.mass, self.theta * self.stage_dt**2, action, self.projection)
+        viscosity = (self.potential, 1 / self.stage_dt) if self.potential.viscous else None
+        return ImplicitOperator(self.mass, self.theta * self.stage_dt**2, action, self.projection, viscosity)
 
     def momentum_residual(self, v: NodeVector) -> NodeVector:
         """The residual of momentum at each node [kg m/s], shape (n, d); in held components, the impulse that holds."""
-        if self.action is not None:
-            return self.operator(v).unconstrained(v) - self.rhs
-        force = self.potential.force(self.displacement(v))
+        if self.action is None:
+            force = self.potential.force(self.displacement(v))
+        else:
+            force = self.force - self.action(self.theta * self.stage_dt * v)
         if self.potential.viscous:
             force = force - self.theta * self.potential.viscous_resistance(v)
         return self.mass[:, None] * (v - self.inertial) - self.stage_dt * force
@@ -133,14 +122,6 @@ class StageProblem(eqx.Module):
         if self.initial_displacement is None:
             return jnp.zeros_like(self.inertial)
         return -self.initial_displacement / (self.theta * self.stage_dt)
-
-    def unit_strain_velocity(self) -> Float[Array, ""]:
-        """The velocity dx/(θΔt_s) [m/s] that strains a cell by one in the stage.
-
-        Deformation gradients are of order one, and rounded to ε, at the smallest strains too. With w this velocity and
-        A the diagonal of the operator, ε A w is the rounding of the momentum residual and ε A w² that of the potential.
-        """
-        return self.spacing / (self.theta * self.stage_dt)
 
     def incremental_potential(self, v: NodeVector) -> Float[Array, ""]:
         """𝓔(v) [J] up to a constant, that of held components; NaN if a law does not admit the deformation."""
@@ -191,7 +172,7 @@ def solve_linearised(
     """The solution of a linearised problem (M + χH) v = b [m/s], shape (n, d), and the report of the solve."""
     operator = problem.operator(guess).precomputed()
     combine = problem.projection.combine
-    rhs, lift = problem.rhs, None
+    rhs, lift = problem.mass[:, None] * problem.inertial + problem.stage_dt * problem.force, None
     if problem.prescribed is not None:
         lift, at_rest = combine(0, problem.prescribed), rhs
         # walls at rest, the common case, spare one application of H
@@ -215,40 +196,34 @@ class Reporting(eqx.Module):
     """Zero."""
 
 
+@ruled
 def solve(
     problem: StageProblem,
+    slot: Array,
     guess: NodeVector,
-    find: Callable[[StageProblem, NodeVector], tuple[NodeVector, SolveInfo]],
-    adjoint: lx.AbstractLinearSolver | Reporting,
+    method: Callable[[StageProblem, NodeVector], tuple[NodeVector, SolveInfo]],
+    adjoint: lx.AbstractLinearSolver,
 ) -> tuple[NodeVector, SolveInfo]:
     """The solution of a problem, differentiable with respect to it in forward and reverse mode, to any order.
 
     Args:
         problem: the problem.
+        slot: that of `Reporting`.
         guess: where the search starts [m/s], shape (n, d). Result and derivative depend on it only within the
-            tolerance.
-        find: how the solution is found.
+            tolerance. No derivative passes it, nor what follows.
+        method: how it is solved, as by an `AbstractStageSolver`.
         adjoint: solver of the tangent and adjoint systems. A solve that ends beyond ten times its tolerance gives NaN,
             so that a wrong gradient cannot pass for a right one.
     """
-    if not isinstance(adjoint, Reporting):
-        adjoint = Reporting(adjoint, jnp.zeros((), guess.dtype))
-    return _solve(problem, adjoint.slot, *without_derivative((guess, find, adjoint.solver)))
-
-
-@ruled
-def _solve(
-    problem: StageProblem, slot: Array, guess: NodeVector, find: Any, adjoint: lx.AbstractLinearSolver
-) -> tuple[NodeVector, SolveInfo]:
     del slot, adjoint
-    return find(problem, guess)
+    return method(problem, guess)
 
 
-@_solve.defjvp
+@solve.defjvp
 def _solve_jvp(primals: Any, tangents: Any) -> Any:
-    problem, slot, guess, find, adjoint = primals
+    problem, slot, guess, method, adjoint = primals
     d_problem, d_slot = tangents[:2]
-    v, info = saved_for_backward(_solve(problem, slot, guess, find, adjoint))
+    v, info = saved_for_backward(solve(problem, slot, guess, method, adjoint))
     d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
     if d_residual is None:  # it does not depend on what is differentiated
         d_residual = jnp.zeros_like(v)

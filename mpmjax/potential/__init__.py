@@ -16,6 +16,5 @@ from mpmjax.potential._term import (
     AbstractTerm as AbstractTerm,
     Displacement as Displacement,
     Forces as Forces,
-    added as added,
     scattered as scattered,
 )

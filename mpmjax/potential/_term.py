@@ -53,15 +53,10 @@ class Forces(NamedTuple):
         return total
 
 
-def added(forces: Sequence[Forces]) -> Forces:
-    """The sum of forces, one or more, before the scatter."""
-    parts = ([a for a in field if a is not None] for field in zip(*forces, strict=True))
-    return Forces(*(reduce(jnp.add, part) if part else None for part in parts))
-
-
 def scattered(forces: Sequence[Forces], stencil: Stencil, size: int) -> NodeVector:
     """The sum of forces, one or more, on all nodes [N], shape (n, d)."""
-    nodes, value, slopes = added(forces)
+    parts = ([a for a in field if a is not None] for field in zip(*forces, strict=True))
+    nodes, value, slopes = (reduce(jnp.add, part) if part else None for part in parts)
     if value is None and slopes is None:
         return jnp.zeros((size, stencil.dim), stencil.offset.dtype) if nodes is None else nodes
     total = scatter(stencil, value, slopes, size)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import NodeVector, Scalar
+from mpmjax.autodiff import without_derivative
 from mpmjax.checks import require_between, require_fields
 from mpmjax.implicit import (
     AbstractHessian,
@@ -31,6 +32,9 @@ from mpmjax.implicit import (
 )
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
+
+Stages = tuple[tuple[Scalar, NodeVector | None], ...]
+"""Weights q [-] and displacements u [m], shape (n, d), of an impulse Δt Σ q f(u); None for u = 0."""
 
 
 class AbstractImplicitIntegrator(AbstractIntegrator):
@@ -66,9 +70,8 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         return getattr(self.solved_by(), "linearises", False)
 
     @abstractmethod
-    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector | None], ...]:
-        """The stages in which the elastic force acts: weights q [-] and displacements u [m], shape (n, d), of the
-        impulse Δt Σ q f(u); None for the start of the step, u = 0."""
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> Stages:
+        """The stages in which the elastic force acts."""
 
     def solve_stage(
         self,
@@ -90,12 +93,16 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             initial_displacement: u at the start of the stage [m], shape (n, d); None for zero.
             theta: θ, the share of the stage's displacement at which its force is evaluated [-].
         """
+        force, action = nodes.force, None
+        if self.linearises:
+            action = self.hessian.at(nodes.potential, None)
+            force = force if initial_displacement is None else force - action(initial_displacement)
         problem = StageProblem(
             mass=nodes.mass,
             inertial=inertial,
             stage_dt=jnp.asarray(stage_dt),
             initial_displacement=initial_displacement,
-            force=nodes.force,
+            force=force,
             spacing=nodes.spacing,
             potential=nodes.potential,
             hessian=self.hessian,
@@ -103,34 +110,32 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             prescribed=nodes.prescribed if nodes.conditions.moves or nodes.potential.mirror.moving else None,
             preconditioner=self.preconditioner,
             theta=theta,
+            action=action,
         )
-        problem = problem.linearised() if self.linearises else problem
-        return solve(problem, guess, self.solved_by(), self.adjoint_solver)
+        adjoint, slot = self.adjoint_solver, jnp.zeros((), guess.dtype)
+        if isinstance(adjoint, Reporting):
+            adjoint, slot = adjoint.solver, adjoint.slot
+        return solve(problem, slot, *without_derivative((guess, self.solved_by(), adjoint)))
 
     def elastic_impulse(
         self,
         nodes: Nodes,
         motion: NodeMotion,
-        stages: tuple[tuple[Scalar, NodeVector | None], ...] | None = None,
-        *,
-        exact: bool = False,
+        stages: Stages | None = None,
     ) -> NodeVector:
-        """Δt Σ q f(u) [kg m/s] of the motion's stages or of others, with the forces that the solution takes or exactly
-        those of the law."""
+        """Δt Σ q f(u) [kg m/s] of the motion's stages or of others, with the forces that the solution takes."""
         stages = self.stages(nodes, motion) if stages is None else stages
-        if self.linearises and not exact:
-            stiffness, mean = self.hessian.at(nodes.potential, None), self.mean_displacement(nodes, motion, stages)
-            return nodes.dt * (sum(q for q, _ in stages) * nodes.force - stiffness(mean))
+        if not self.linearises:
+            return self.exact_impulse(nodes, motion, stages)
+        stiffness, mean = self.hessian.at(nodes.potential, None), self.mean_displacement(nodes, motion, stages)
+        return nodes.dt * (sum(q for q, _ in stages) * nodes.force - stiffness(mean))
+
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion, stages: Stages | None = None) -> NodeVector:
+        stages = self.stages(nodes, motion) if stages is None else stages
         forces = (q * (nodes.force if u is None else nodes.potential.force(u)) for q, u in stages)
         return nodes.dt * reduce(jnp.add, forces)
 
-    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
-        """Δt Σ q f(u) [kg m/s], with the forces of the law."""
-        return self.elastic_impulse(nodes, motion, exact=True)
-
-    def mean_displacement(
-        self, nodes: Nodes, motion: NodeMotion, stages: tuple[tuple[Scalar, NodeVector | None], ...] | None = None
-    ) -> NodeVector:
+    def mean_displacement(self, nodes: Nodes, motion: NodeMotion, stages: Stages | None = None) -> NodeVector:
         """Σ q u [m] of the motion's stages or of others."""
         stages = self.stages(nodes, motion) if stages is None else stages
         return reduce(jnp.add, (q * u for q, u in stages if u is not None))
@@ -198,7 +203,7 @@ class SemiImplicit(AbstractImplicitIntegrator):
         v, info = self.solve_stage(nodes, guess, inertial, nodes.dt, theta=beta)
         return NodeMotion(v, resisted=(1 - beta) * v0 + beta * v if viscous else None), info
 
-    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> Stages:
         """One, at βΔt v^{n+1}."""
         return ((1, self.beta * nodes.dt * motion.velocity),)
 
@@ -235,7 +240,7 @@ class BackwardEuler(AbstractImplicitIntegrator):
         v, info = self.solve_stage(nodes, guess, nodes.inertial_velocity(), nodes.dt)
         return NodeMotion(v, resisted=v if nodes.potential.viscous else None), info
 
-    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> Stages:
         """One, at Δt v^{n+1}."""
         return ((1, nodes.dt * motion.velocity),)
 
@@ -272,7 +277,7 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
         mean, info = self.solve_stage(nodes, guess, v0 + half * nodes.acceleration, half)
         return NodeMotion(2 * mean - v0, mean, resisted=mean if nodes.potential.viscous else None), info
 
-    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> Stages:
         """One, at ½Δt v̄."""
         return ((1, nodes.dt / 2 * motion.carrier),)
 
@@ -345,7 +350,7 @@ class TRBDF2(AbstractImplicitIntegrator):
         mean = motion.carrier + self.weights()[3] * change
         return replace(motion, velocity=motion.velocity + change, mean=mean)
 
-    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector | None], ...]:
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> Stages:
         """Stages at 0, γΔt and Δt."""
         _, q0, q1, q2 = self.weights()
         inner = motion.carrier if motion.inner is None else motion.inner
