@@ -117,7 +117,7 @@ def is_enum(hint: Any) -> bool:
     return isinstance(hint, type) and issubclass(hint, enum.Enum)
 
 
-def shape_of(value: Any) -> tuple[int, ...] | None:
+def shape_of(value: Any) -> Any:
     """The shape of a number, an array or nested sequences of numbers; None if it is none of these, or ragged."""
     if isinstance(value, np.ma.MaskedArray):  # NumPy drops the mask wherever it converts one
         return None

@@ -20,7 +20,6 @@ from typing import Any
 
 import h5py
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mpmjax.checks import canonical, require, require_finite, require_positive
@@ -323,17 +322,17 @@ def states_in(rows: dict[str, np.ndarray], like: State) -> State:
         return taken(f"VTKHDF/PointData/{name}", 3, 3)[..., :d, :d]
 
     F, J = tensors("deformation_gradient"), taken("VTKHDF/PointData/J")
-    each = [(J if stored.ndim == 1 else F)[:, of] for of, stored, _ in by_material(like)]
     history = [
-        jnp.asarray(rows[f"VTKHDF/PointData/{name}"].reshape(-1, p)[:, of]) for name, of, _ in history_arrays(like)
+        rows[f"VTKHDF/PointData/{name}"].reshape(-1, p)[:, of] for name, of, _ in history_arrays(like)
     ]  # kept, since laws may share a name
-    return State(
-        x=jnp.asarray(taken("VTKHDF/Points", 3)[..., :d]),
-        v=jnp.asarray(taken("VTKHDF/PointData/velocity", 3)[..., :d]),
-        deformations=tuple(jnp.asarray(stored) for stored in each),
-        C=None if like.C is None else jnp.asarray(tensors("affine_velocity")),
-        histories=jax.tree.unflatten(jax.tree.structure(like.histories), history),
+    parts = (
+        taken("VTKHDF/Points", 3)[..., :d],
+        taken("VTKHDF/PointData/velocity", 3)[..., :d],
+        None if like.C is None else tensors("affine_velocity"),
+        tuple((J if stored.ndim == 1 else F)[:, of] for of, stored, _ in by_material(like)),
+        jax.tree.unflatten(jax.tree.structure(like.histories), history),
     )
+    return State(*jax.device_put(parts))
 
 
 def _padded(a: np.ndarray, diagonal: float) -> np.ndarray:
