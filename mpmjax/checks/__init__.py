@@ -4,6 +4,7 @@ from mpmjax.checks._kinds import (
     alternatives as alternatives,
     checked as checked,
     choices as choices,
+    is_abstract as is_abstract,
     is_enum as is_enum,
     is_module as is_module,
     is_own as is_own,

@@ -112,6 +112,11 @@ def is_module(hint: Any) -> bool:
     return isinstance(hint, type) and issubclass(hint, eqx.Module)
 
 
+def is_abstract(hint: Any) -> bool:
+    """Whether an annotation is a base class of modules, by its methods or, if all have defaults, by its name."""
+    return is_module(hint) and (inspect.isabstract(hint) or hint.__name__.startswith("Abstract"))
+
+
 def is_enum(hint: Any) -> bool:
     """Whether an annotation is an enumeration."""
     return isinstance(hint, type) and issubclass(hint, enum.Enum)
@@ -177,7 +182,7 @@ def choices(hint: Any) -> dict[str, Any]:
     base class, those below it in alphabetical order, a user's own among them."""
 
     def below(kind: type) -> dict[str, Any]:
-        if inspect.isabstract(kind) or kind.__name__.startswith("Abstract"):
+        if is_abstract(kind):
             return {name: c for sub in kind.__subclasses__() for name, c in below(sub).items()}
         room = ".".join(kind.__module__.split(".")[:2])
         internal = is_own(kind) and not hasattr(sys.modules[room], kind.__name__)

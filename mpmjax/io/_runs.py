@@ -32,15 +32,7 @@ from tqdm import tqdm
 
 from mpmjax._types import Scalar
 from mpmjax.boundary import Impulses
-from mpmjax.checks import (
-    canonical,
-    checked,
-    is_traced,
-    require,
-    require_memory,
-    require_whole,
-    requirements,
-)
+from mpmjax.checks import canonical, checked, is_traced, require, require_memory, require_whole, requirements
 from mpmjax.io._run_file import (
     File,
     check_hdf5,
@@ -61,7 +53,7 @@ from mpmjax.io._run_file import (
     states_in,
 )
 from mpmjax.io._schema import decode
-from mpmjax.io._transactional_file import StagedFile, reason, replacing, reporting, staged_file, undisturbed
+from mpmjax.io._transactional_file import StagedFile, reason, replacing, reporting, undisturbed
 from mpmjax.simulation import (
     Fault,
     RolloutState,
@@ -122,7 +114,7 @@ class FrameWriter:
         begin = initial_state(scene, particles)
         rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
         check_hdf5(path)
-        staged = staged_file(path)
+        staged = StagedFile(path)
         try:
             with reading(path) as file:
                 for i in range(count_in(file)):
@@ -213,7 +205,7 @@ def _new(path: Path, scene: Scene, particles: Particles, method: AbstractIntegra
     """A writer of a new file, without frames, which is at `path` when the block has ended without an error."""
     described, begin = describe(scene, particles, method, dt), initial_state(scene, particles)
     rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
-    with replacing(path) as aside, staged_file(aside) as staged:
+    with replacing(path) as aside, StagedFile(aside) as staged:
         file = created(staged, path, described, rows)
         file.flush()
         staged.commit()
