@@ -107,19 +107,14 @@ def may_be_infinite(hint: Any) -> bool:
     return get_origin(hint) in (typing.Union, UnionType) and any(may_be_infinite(member) for member in get_args(hint))
 
 
-def is_module(hint: Any) -> bool:
-    """Whether an annotation is a class of modules."""
-    return isinstance(hint, type) and issubclass(hint, eqx.Module)
+def is_class(hint: Any, base: type) -> bool:
+    """Whether an annotation is a class of a base, such as `eqx.Module`."""
+    return isinstance(hint, type) and issubclass(hint, base)
 
 
 def is_abstract(hint: Any) -> bool:
     """Whether an annotation is a base class of modules, by its methods or, if all have defaults, by its name."""
-    return is_module(hint) and (inspect.isabstract(hint) or hint.__name__.startswith("Abstract"))
-
-
-def is_enum(hint: Any) -> bool:
-    """Whether an annotation is an enumeration."""
-    return isinstance(hint, type) and issubclass(hint, enum.Enum)
+    return is_class(hint, eqx.Module) and (inspect.isabstract(hint) or hint.__name__.startswith("Abstract"))
 
 
 def shape_of(value: Any) -> Any:
@@ -192,9 +187,9 @@ def choices(hint: Any) -> dict[str, Any]:
     for a in alternatives(hint):
         if get_origin(a) in (tuple, list):
             names |= {name: c for item in get_args(a) for name, c in choices(item).items()}
-        elif is_enum(a):
+        elif is_class(a, enum.Enum):
             names |= {str(member): member for member in a}
-        elif is_module(a):
+        elif is_class(a, eqx.Module):
             names |= dict(sorted(below(a).items()))
     return names
 
@@ -230,7 +225,7 @@ def _plain(hint: Any) -> str:
         return "a function"
     if origin is dict:
         return f"a dict with {_in_words(args[1])} for each name"
-    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+    if is_class(hint, AbstractArray):
         axes, more = _axes(hint)
         return "an array of numbers" if more else ("a number", "a sequence of numbers", "rows of numbers")[min(axes, 2)]
     return _WORDS.get(hint, f"of a class derived from {getattr(hint, '__name__', hint)}")

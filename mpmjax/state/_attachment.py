@@ -135,18 +135,11 @@ class Patch(AbstractPlace):
         particle = _nearest(x, middle, apart, self)
         axis = np.abs(area).argmax(axis=1)
         facing = 2 * axis + (np.take_along_axis(area, axis[:, None], axis=1)[:, 0] > 0)
-        _, piece = np.unique(np.stack([particle, facing]), axis=1, return_inverse=True)
-
-        def summed(a: np.ndarray) -> np.ndarray:
-            total = np.zeros((piece.max() + 1, *a.shape[1:]))
-            np.add.at(total, piece.reshape(-1), a)
-            return total
-
-        whole = summed(weight)
-        middle = summed(weight[:, None] * middle) / whole[:, None]
-        first = np.zeros(len(whole), int)
-        first[piece.reshape(-1)] = particle
-        return _attached(particles, first, middle, whole, summed(area))
+        one, piece = np.unique(np.stack([particle, facing]), axis=1, return_inverse=True)
+        summed = np.zeros((one.shape[1], 1 + 2 * self.dim))
+        np.add.at(summed, piece.reshape(-1), np.column_stack([weight, weight[:, None] * middle, area]))
+        whole, moment, area = np.split(summed, [1, 1 + self.dim], axis=1)
+        return _attached(particles, one[0], moment / whole, whole[:, 0], area)
 
 
 class PointsAt(AbstractPlace):
