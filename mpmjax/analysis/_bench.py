@@ -32,7 +32,6 @@ _FEW = 1000  # explicit steps that no implicit run which follows the motion is c
 
 Build = Callable[[int], tuple[Scene, Particles]]
 """A function of a refinement n, which returns the scene at 1/n of its spacing, and its particles."""
-Say = Callable[[str], None]
 
 
 class Trial(NamedTuple):
@@ -177,24 +176,29 @@ def _rms(distance: np.ndarray) -> Any:
     return np.sqrt((distance**2).sum(axis=-1).mean(axis=-1))
 
 
-class _RefinedRun(NamedTuple):
-    """A run, and its relative change of the motion of the run before."""
-
-    bench: Bench
-    steps: int
-    seconds: float
-    states: list[State] | None
-    motion: Displacements | None  # None if the run failed
-    change: float
-
-
 def settle(
-    build: Build, bench: Bench, error: float, seconds: float, say: Say = lambda line: None
+    build: Build, bench: Bench, error: float, seconds: float, say: Callable[[str], None] = lambda line: None
 ) -> tuple[float, Trial, Displacements]:
     """The best reference run within `seconds`, compilation included: the longest explicit step on the grid of the
     scene's own bench that trials may take, `stable_dt` of the whole motion [s]; the run, whose error is an estimate,
     for trials of this target error; and its motion. `say` is called with a line on each run. A ValueError says that
     nothing moves, or why no run ended well in that time."""
+    more = (
+        f"more than the {seconds:.3g} s that a reference is given. Allow more (most_seconds in [run], --most-seconds), "
+        "choose a shorter t1, or give dt and method."
+    )
+
+    def refined(bench: Bench, steps: int) -> tuple[Trial, list[State] | None, Displacements | None]:
+        """A run, its error the change from the motion of the run before; its states and its motion, None if it
+        failed."""
+        states, _, seconds = bench.run(method, steps)
+        motion = None if states is None else bench.motion(states)
+        change = math.inf if motion is None or coarse is None else coarse.distance(motion)
+        spacing = f", spacing / {bench.refinement}" if bench.refinement > 1 else ""
+        outcome = "failed" if motion is None else "" if math.isinf(change) else f"changes the motion by {change:.2g}"
+        say(f"reference: {name_of(method)}, {steps} steps{spacing}: {seconds:.2g} s {outcome}".rstrip())
+        return Trial(method, bench.refinement, bench.t1 / steps, steps, seconds, change), states, motion
+
     clock, growth = Clock(seconds), 2 ** (bench.particles.dim + 1)
     limit = bench.limit([])
     steps, method = bench.whole(limit), Explicit()
@@ -203,17 +207,18 @@ def settle(
     if (1 + growth) * foreseen > clock.left and steps > _FEW:
         steps, method = 2 * FRAMES, TRBDF2()
     elif not clock.allows(2 * foreseen):
-        raise ValueError(f"{steps} explicit steps take {foreseen:.2g} s and two runs are needed: {_more(seconds)}")
-    good = None
+        raise ValueError(f"{steps} explicit steps take {foreseen:.2g} s and two runs are needed: {more}")
+    good: Trial | None = None
+    coarse: Displacements | None = None  # the motion of that run
     while True:  # until the step resolves the motion, or the time is up
-        new, dt = _refined_run(bench, method, steps, good, say), bench.t1 / steps
-        if new.states is not None and new.motion is not None:
-            require(new.motion.size > 0, "Nothing moves in this scene, so there is no motion to be right or wrong.")
-            limit, good = min(limit, bench.limit(new.states)), new
+        new, states, motion = refined(bench, steps)
+        if states is not None and motion is not None:
+            require(motion.size > 0, "Nothing moves in this scene, so there is no motion to be right or wrong.")
+            limit, good, coarse = min(limit, bench.limit(states)), new, motion
         allowed = clock.allows(2 * new.seconds)
-        if good is not None and (new.change <= error / 3 or dt <= limit * (1 + 1e-9) or not allowed):
+        if good is not None and (new.error <= error / 3 or new.dt <= limit * (1 + 1e-9) or not allowed):
             break
-        if not allowed or (good is None and dt < limit / HOPELESS):
+        if not allowed or (good is None and new.dt < limit / HOPELESS):
             why = "It ended well."
             try:
                 bench.timed(method, steps, FRAMES, steps // FRAMES, throw=True)
@@ -224,39 +229,17 @@ def settle(
                 f"the step will not do or takes too long. {why}"
             )
         steps = max(2 * steps, bench.whole(limit) if method.is_explicit else 0)
-    while growth * good.seconds < clock.left and (good.bench is bench or good.change > error / 3):
-        finer = _refined_run(Bench.of(build, 2 * good.bench.refinement, bench.t1), method, 2 * good.steps, good, say)
-        if finer.motion is None:
+    while growth * good.seconds < clock.left and (good.refinement == bench.refinement or good.error > error / 3):
+        new, _, motion = refined(Bench.of(build, 2 * good.refinement, bench.t1), 2 * good.steps)
+        if motion is None:
             break
-        good = finer
-    alone = good.bench is bench  # there was no time for a finer grid
-    while alone and good.change > error / 3 and (math.isinf(good.change) or clock.allows(2 * good.seconds)):
-        again = _refined_run(bench, method, 2 * good.steps, good, say)
-        if again.motion is None:
+        good, coarse = new, motion
+    alone = good.refinement == bench.refinement  # there was no time for a finer grid
+    while alone and good.error > error / 3 and (math.isinf(good.error) or clock.allows(2 * good.seconds)):
+        new, _, motion = refined(bench, 2 * good.steps)
+        if motion is None:
             break
-        good = again
-    assert good.motion is not None
-    require(math.isfinite(good.change), f"The motion of one run only is known: {_more(seconds)}")
-    refinement, dt = good.bench.refinement, bench.t1 / good.steps
-    trial = Trial(method, refinement, dt, good.steps, good.seconds, good.change)
-    return limit, trial, good.motion
-
-
-def _refined_run(
-    bench: Bench, method: AbstractIntegrator, steps: int, before: _RefinedRun | None, say: Say
-) -> _RefinedRun:
-    states, _, seconds = bench.run(method, steps)
-    motion = None if states is None else bench.motion(states)
-    coarse = None if before is None else before.motion
-    change = math.inf if motion is None or coarse is None else coarse.distance(motion)
-    spacing = f", spacing / {bench.refinement}" if bench.refinement > 1 else ""
-    outcome = "failed" if motion is None else "" if math.isinf(change) else f"changes the motion by {change:.2g}"
-    say(f"reference: {name_of(method)}, {steps} steps{spacing}: {seconds:.2g} s {outcome}".rstrip())
-    return _RefinedRun(bench, steps, seconds, states, motion, change)
-
-
-def _more(seconds: float) -> str:
-    return (
-        f"more than the {seconds:.3g} s that a reference is given. Allow more (most_seconds in [run], --most-seconds), "
-        "choose a shorter t1, or give dt and method."
-    )
+        good, coarse = new, motion
+    assert coarse is not None
+    require(math.isfinite(good.error), f"The motion of one run only is known: {more}")
+    return limit, good, coarse

@@ -107,17 +107,17 @@ def may_be_infinite(hint: Any) -> bool:
     return get_origin(hint) in (typing.Union, UnionType) and any(may_be_infinite(member) for member in get_args(hint))
 
 
-def is_module(hint: Any) -> bool:
-    """Whether an annotation is a class of modules."""
-    return isinstance(hint, type) and issubclass(hint, eqx.Module)
+def is_class(hint: Any, base: type) -> bool:
+    """Whether an annotation is a class of a base, such as `eqx.Module`."""
+    return isinstance(hint, type) and issubclass(hint, base)
 
 
-def is_enum(hint: Any) -> bool:
-    """Whether an annotation is an enumeration."""
-    return isinstance(hint, type) and issubclass(hint, enum.Enum)
+def is_abstract(hint: Any) -> bool:
+    """Whether an annotation is a base class of modules, by its methods or, if all have defaults, by its name."""
+    return is_class(hint, eqx.Module) and (inspect.isabstract(hint) or hint.__name__.startswith("Abstract"))
 
 
-def shape_of(value: Any) -> tuple[int, ...] | None:
+def shape_of(value: Any) -> Any:
     """The shape of a number, an array or nested sequences of numbers; None if it is none of these, or ragged."""
     if isinstance(value, np.ma.MaskedArray):  # NumPy drops the mask wherever it converts one
         return None
@@ -177,7 +177,7 @@ def choices(hint: Any) -> dict[str, Any]:
     base class, those below it in alphabetical order, a user's own among them."""
 
     def below(kind: type) -> dict[str, Any]:
-        if inspect.isabstract(kind) or kind.__name__.startswith("Abstract"):
+        if is_abstract(kind):
             return {name: c for sub in kind.__subclasses__() for name, c in below(sub).items()}
         room = ".".join(kind.__module__.split(".")[:2])
         internal = is_own(kind) and not hasattr(sys.modules[room], kind.__name__)
@@ -187,9 +187,9 @@ def choices(hint: Any) -> dict[str, Any]:
     for a in alternatives(hint):
         if get_origin(a) in (tuple, list):
             names |= {name: c for item in get_args(a) for name, c in choices(item).items()}
-        elif is_enum(a):
+        elif is_class(a, enum.Enum):
             names |= {str(member): member for member in a}
-        elif is_module(a):
+        elif is_class(a, eqx.Module):
             names |= dict(sorted(below(a).items()))
     return names
 
@@ -225,7 +225,7 @@ def _plain(hint: Any) -> str:
         return "a function"
     if origin is dict:
         return f"a dict with {_in_words(args[1])} for each name"
-    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+    if is_class(hint, AbstractArray):
         axes, more = _axes(hint)
         return "an array of numbers" if more else ("a number", "a sequence of numbers", "rows of numbers")[min(axes, 2)]
     return _WORDS.get(hint, f"of a class derived from {getattr(hint, '__name__', hint)}")

@@ -33,7 +33,7 @@ def _batched(
     batches = np.zeros((max(1, -(-len(x) // _BATCH)), _BATCH, x.shape[1]), dtype)
     batches.reshape(-1, x.shape[1])[: len(x)] = x
     region = canonical(region, dtype)
-    results = [function(region, jnp.asarray(batch)) for batch in batches]
+    results = [function(region, jax.device_put(batch)) for batch in batches]
     return [np.concatenate(parts).astype(float)[: len(x)] for parts in zip(*results, strict=True)]
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Point, Scalar
-from mpmjax.checks import coordinates, require, require_fields, require_finite, require_that
+from mpmjax.checks import coordinates, require, require_fields, require_finite, require_that, shape_of
 
 Times = Float[Array, "j"] | Float[np.ndarray, "j"] | tuple[float | int | Array, ...] | list[float | int | Array]
 Displacements = Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
@@ -37,7 +37,7 @@ class AbstractMotion(eqx.Module):
     @property
     def dim(self) -> int:
         """Space dimension d."""
-        return jnp.shape(jnp.asarray(self.displacement))[1]
+        return shape_of(self.displacement)[1]
 
     def at(self, t: Scalar) -> Float[Array, "d"]:
         """Displacement at time t [m], shape (d,); of a body that turns, that of its centre."""
@@ -120,7 +120,7 @@ class RigidMotion(AbstractMotion):
     def __check_init__(self):
         require_fields(self)
         _check_rows("A rigid motion", self.times, self.displacement)
-        d, shape = self.dim, jnp.shape(jnp.asarray(self.rotation))
+        d, shape = self.dim, shape_of(self.rotation)
         require(d in (2, 3), f"A rigid motion is two- or three-dimensional, got {d} coordinates: take a Motion.")
         expected = (len(self.times),) if d == 2 else (len(self.times), 3)
         require(shape == expected, f"A rigid motion's rotation must have shape {expected} here, got {shape}.")
@@ -175,7 +175,7 @@ def _constant(rows: Any) -> bool:
 
 
 def _check_rows(name: str, times: Times, displacement: Displacements) -> None:
-    j, rows = jnp.shape(jnp.asarray(times)), jnp.shape(jnp.asarray(displacement))
+    j, rows = shape_of(times), shape_of(displacement)
     require(
         len(j) == 1 and len(rows) == 2 and j[0] == rows[0],
         f"{name} needs one row of displacements a time, got shapes {j} and {rows}.",
@@ -245,7 +245,7 @@ class TimeSeries(eqx.Module):
 
     def __check_init__(self):
         require_fields(self)
-        j, rows = jnp.shape(jnp.asarray(self.times)), jnp.shape(jnp.asarray(self.values))
+        j, rows = shape_of(self.times), shape_of(self.values)
         require(
             len(j) == 1 and len(rows) in (1, 2) and j[0] == rows[0] > 0,
             f"A time series needs one value or vector a time, got shapes {j} and {rows}.",
@@ -277,12 +277,12 @@ def require_some(name: str, value: Changing | ChangingVector) -> None:
         ValueError: it has none, or one that is not finite.
     """
     if not isinstance(value, TimeSeries):
-        require(jnp.size(jnp.asarray(value)) > 0, f"{name} must have a number at least, got {value}.")
+        require(0 not in (shape_of(value) or ()), f"{name} must have a number at least, got {value}.")
         require_finite(name, value)
 
 
 def vector_size(value: Changing | ChangingVector) -> int | None:
     """How many components a vector has that is constant or a time series; None of a number."""
-    shape = jnp.shape(jnp.asarray(value.values if isinstance(value, TimeSeries) else value))
+    shape = shape_of(value.values if isinstance(value, TimeSeries) else value)
     rest = shape[1:] if isinstance(value, TimeSeries) else shape
     return rest[0] if len(rest) == 1 else None

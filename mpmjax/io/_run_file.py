@@ -20,12 +20,11 @@ from typing import Any
 
 import h5py
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mpmjax.checks import canonical, require, require_finite, require_positive
 from mpmjax.io._schema import decode, encode
-from mpmjax.io._transactional_file import BUSY, StagedFile, reason, require_no_writer
+from mpmjax.io._transactional_file import StagedFile, reason, require_no_writer
 from mpmjax.state import Particles, Scene, State, by_material, history_arrays
 from mpmjax.stepping import AbstractIntegrator
 
@@ -77,7 +76,7 @@ def check_place(path: Path, *, overwrite: bool) -> None:
         return
     require(overwrite, f"{path} exists: choose another name, remove it, or ask to overwrite or to resume it.")
     require(path.is_file(), f"{path} is not a file: choose another name.")
-    check_no_writer(path)  # first: what is just being written may not be a whole run to look at
+    require_no_writer(path)  # first: what is just being written may not be a whole run to look at
     if path.stat().st_size > 0:
         try:
             with h5py.File(path, "r", locking=False) as file:
@@ -85,16 +84,6 @@ def check_place(path: Path, *, overwrite: bool) -> None:
         except OSError:
             run = False
         require(run, f"{path} is not a run that mpmjax wrote, and is not replaced: choose another name, or remove it.")
-
-
-def check_no_writer(path: Path) -> None:
-    """Raise `ValueError` if somebody is writing the file."""
-    try:
-        require_no_writer(path)
-    except BlockingIOError:
-        raise ValueError(BUSY.format(path)) from None
-    except OSError:
-        return  # whoever opens it next says why it cannot
 
 
 def check_hdf5(path: Path) -> None:
@@ -323,17 +312,17 @@ def states_in(rows: dict[str, np.ndarray], like: State) -> State:
         return taken(f"VTKHDF/PointData/{name}", 3, 3)[..., :d, :d]
 
     F, J = tensors("deformation_gradient"), taken("VTKHDF/PointData/J")
-    each = [(J if stored.ndim == 1 else F)[:, of] for of, stored, _ in by_material(like)]
     history = [
-        jnp.asarray(rows[f"VTKHDF/PointData/{name}"].reshape(-1, p)[:, of]) for name, of, _ in history_arrays(like)
+        rows[f"VTKHDF/PointData/{name}"].reshape(-1, p)[:, of] for name, of, _ in history_arrays(like)
     ]  # kept, since laws may share a name
-    return State(
-        x=jnp.asarray(taken("VTKHDF/Points", 3)[..., :d]),
-        v=jnp.asarray(taken("VTKHDF/PointData/velocity", 3)[..., :d]),
-        deformations=tuple(jnp.asarray(stored) for stored in each),
-        C=None if like.C is None else jnp.asarray(tensors("affine_velocity")),
-        histories=jax.tree.unflatten(jax.tree.structure(like.histories), history),
+    parts = (
+        taken("VTKHDF/Points", 3)[..., :d],
+        taken("VTKHDF/PointData/velocity", 3)[..., :d],
+        None if like.C is None else tensors("affine_velocity"),
+        tuple((J if stored.ndim == 1 else F)[:, of] for of, stored, _ in by_material(like)),
+        jax.tree.unflatten(jax.tree.structure(like.histories), history),
     )
+    return State(*jax.device_put(parts))
 
 
 def _padded(a: np.ndarray, diagonal: float) -> np.ndarray:
@@ -401,7 +390,7 @@ def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 def steps_in(path: Path) -> int:
     """How many steps led to the last frame of a file, −1 if that is not known. Raises what `load` does, and for a file
     that is being written."""
-    check_no_writer(path)
+    require_no_writer(path)
     with reading(path) as file:
         require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
         return int(file["mpmjax/frames"][count_in(file) - 1]["steps"])

@@ -24,6 +24,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,15 +32,7 @@ from tqdm import tqdm
 
 from mpmjax._types import Scalar
 from mpmjax.boundary import Impulses
-from mpmjax.checks import (
-    canonical,
-    checked,
-    is_traced,
-    require,
-    require_memory,
-    require_whole,
-    requirements,
-)
+from mpmjax.checks import canonical, checked, is_traced, require, require_memory, require_whole, requirements
 from mpmjax.io._run_file import (
     File,
     check_hdf5,
@@ -60,7 +53,7 @@ from mpmjax.io._run_file import (
     states_in,
 )
 from mpmjax.io._schema import decode
-from mpmjax.io._transactional_file import StagedFile, reason, replacing, reporting, staged_file, undisturbed
+from mpmjax.io._transactional_file import StagedFile, reason, replacing, reporting, undisturbed
 from mpmjax.simulation import (
     Fault,
     RolloutState,
@@ -121,7 +114,7 @@ class FrameWriter:
         begin = initial_state(scene, particles)
         rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
         check_hdf5(path)
-        staged = staged_file(path)
+        staged = StagedFile(path)
         try:
             with reading(path) as file:
                 for i in range(count_in(file)):
@@ -169,7 +162,7 @@ class FrameWriter:
         """Step number, state and statistics of the last frame."""
         n = count_in(self._file)
         steps, states, tallies = _frames(self._file, self._like, n - 1, n)
-        return int(steps[0]), *jax.tree.map(lambda a: a[0], (states, tallies))
+        return int(steps[0]), *_at((states, tallies), 0)
 
     def standing(self, then: str) -> str:
         """A sentence on what the file holds, and then what to do. It reads nothing, so that any thread may call it at
@@ -212,7 +205,7 @@ def _new(path: Path, scene: Scene, particles: Particles, method: AbstractIntegra
     """A writer of a new file, without frames, which is at `path` when the block has ended without an error."""
     described, begin = describe(scene, particles, method, dt), initial_state(scene, particles)
     rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
-    with replacing(path) as aside, staged_file(aside) as staged:
+    with replacing(path) as aside, StagedFile(aside) as staged:
         file = created(staged, path, described, rows)
         file.flush()
         staged.commit()
@@ -295,7 +288,7 @@ def record(
             while healthy and step < end:
                 count = min(save_every - (step - start) % save_every, end - step)
                 state, new, before = segment(scene, particles, state, step, count, dt_, method, max_steps=save_every)
-                statistics, step = statistics.merged(new), step + int(new.steps)
+                statistics, step = _merged(statistics, new), step + int(new.steps)
                 healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
                 if healthy:
                     append(step, state, statistics)
@@ -336,13 +329,13 @@ def save(path: str | os.PathLike, run: Run) -> None:
     require(run.final.x.ndim == 2, "Save a batch of runs one by one: jax.tree.map(lambda a: a[i], run).")
     final_step = int(run.final_step)
     count = int((np.asarray(run.steps) < final_step).sum())  # beyond it lie frames of a run that met a fault
-    steps, frames = jax.tree.map(lambda a: a[:count], (np.asarray(run.steps), run.frames))
+    steps, frames = _at((run.steps, run.frames), slice(count))
     states = (state_of(run.final),) if frames is None else (frames, state_of(run.final))
     check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
     unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.statistics)
     with _new(path, run.scene, run.final, run.method, run.dt) as writer:
         for i in range(count):
-            frame = jax.tree.map(lambda a, i=i: a[i], (frames, run.collider_impulse, run.boundary_impulse))
+            frame = _at((frames, run.collider_impulse, run.boundary_impulse), i)
             writer.append(int(steps[i]), RolloutState(*frame), unknown)
         received = run.final_collider_impulse, run.final_boundary_impulse
         writer.append(final_step, RolloutState(state_of(run.final), *received), run.statistics)
@@ -370,26 +363,35 @@ def load(path: str | os.PathLike) -> Run:
         scene = decode(described["scene"], Scene, "scene", arrays)
         method = decode(described["method"], AbstractIntegrator, "method", arrays)
         scene, method = canonical((scene, method), dtype)
-        parts: dict[str, Any] = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
-        blank = jnp.zeros((len(parts["mass"]), scene.grid.dim), dtype)
+        parts: dict[str, Any] = jax.device_put(described["particles"])
+        blank = jax.device_put(np.zeros((len(parts["mass"]), scene.grid.dim), dtype))
         particles = Particles(blank, blank, **parts, counts=described["counts"])
         like = jax.eval_shape(lambda: initial_state(scene, prepare(scene, particles)))
         steps, frames, tallies = _frames(file, like, 0, count_in(file))
         check_numbers(scene, described["dt"], steps, frames.particles)
-    last = jax.tree.map(lambda a: a[-1], frames)
+    last, statistics = _at((frames, tallies), -1)
     return run_to(
         last,
         steps[-1],
-        jax.tree.map(lambda a: a[-1], tallies),
+        statistics,
         scene,
         particles,
-        jnp.asarray(described["dt"], dtype),
+        canonical(described["dt"], dtype),
         method,
-        steps=jnp.asarray(steps, dtype),
+        steps=canonical(steps, dtype),
         frames=frames.particles,
         collider_impulse=frames.collider_impulse,
         boundary_impulse=frames.boundary_impulse,
     )
+
+
+_merged = eqx.filter_jit(RunStatistics.merged)
+
+
+def _at(tree: Any, index: int | slice) -> Any:
+    """The entries of arrays along their first axis. NumPy takes them: each operation of JAX by itself is a program to
+    compile."""
+    return jax.tree.map(lambda a: jax.device_put(np.asarray(a)[index]), tree)
 
 
 def _rows(frame: int, step: int, dt: Any, state: RolloutState, statistics: RunStatistics) -> dict[str, np.ndarray]:
@@ -408,10 +410,10 @@ def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.n
     count."""
     rows = frame_rows(file, start, stop)
     table = rows["mpmjax/frames"]
-    tallies = RunStatistics(**{f.name: jnp.asarray(table[f.name]) for f in fields(RunStatistics)})
+    tallies = RunStatistics(**jax.device_put({f.name: table[f.name] for f in fields(RunStatistics)}))
     received: dict[str, Any] = {}
     for name in _IMPULSES:
         if getattr(like, name) is not None:
-            both = jnp.asarray(rows[f"mpmjax/{name}"])
-            received[name] = Impulses(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
+            both = np.split(rows[f"mpmjax/{name}"], [like.particles.x.shape[1]], axis=-1)
+            received[name] = Impulses(*jax.device_put(both))
     return table["step"], RolloutState(states_in(rows, like.particles), **received), tallies

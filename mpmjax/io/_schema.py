@@ -14,18 +14,18 @@ constructors of known classes and executes nothing else.
 import difflib
 import enum
 import inspect
-import math
 import typing
 from collections.abc import Callable, Iterable
 from dataclasses import fields
 from functools import cache
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import AbstractArray
 
-from mpmjax.checks import alternatives, choices, is_enum, is_module, is_own, may_be_infinite, require
+from mpmjax.checks import alternatives, choices, is_abstract, is_class, is_own, may_be_infinite, require, shortened
 from mpmjax.state import Scene
 from mpmjax.stepping import AbstractIntegrator
 
@@ -63,7 +63,7 @@ def register(cls: Registered) -> Registered:
     Raises:
         ValueError: no such class, a name that another class has, or an argument that files cannot hold.
     """
-    require(is_module(cls), f"register takes a class, an equinox.Module, got {_short(cls)}.")
+    require(is_class(cls, eqx.Module), f"register takes a class, an equinox.Module, got {_short(cls)}.")
     name = cls.__name__
     other = next((c for c in _known() if c.__name__ == name), cls)
     require(
@@ -99,17 +99,12 @@ def _can_be_held(hint: Any) -> bool:
     """Whether some value of an annotation can stand in a file."""
 
     def can(a: Any) -> bool:
-        if is_module(a):  # made of its fields; those of `equinox.nn` are made of sizes and a key
-            return _is_abstract(a) or set(_parameters(a)) <= {f.name for f in fields(a)}
+        if is_class(a, eqx.Module):  # made of its fields; those of `equinox.nn` are made of sizes and a key
+            return is_abstract(a) or set(_parameters(a)) <= {f.name for f in fields(a)}
         items = get_args(a) if get_origin(a) in (tuple, list) else ()
-        return is_enum(a) or any(_can_be_held(item) for item in items if item is not Ellipsis)
+        return is_class(a, enum.Enum) or any(_can_be_held(item) for item in items if item is not Ellipsis)
 
     return bool(_forms(hint)) or any(can(a) for a in alternatives(hint))
-
-
-def _is_abstract(hint: Any) -> bool:
-    """Whether an annotation is a base class of modules, by its methods or, if all have defaults, by its name."""
-    return is_module(hint) and (inspect.isabstract(hint) or hint.__name__.startswith("Abstract"))
 
 
 _SMALL = 64  # most numbers that are written out, and that are read as a tuple where both are taken
@@ -152,7 +147,7 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     name, such as "[material]", `arrays` what `encode` put aside. A ValueError says in one line what is unknown,
     missing or unfit, or what the constructor refuses."""
     options = alternatives(expected)
-    fitting = (c for c in _known() if any(is_module(a) and issubclass(c, a) for a in options))
+    fitting = (c for c in _known() if any(is_class(a, eqx.Module) and issubclass(c, a) for a in options))
     classes = {c.__name__: c for c in sorted(fitting, key=lambda c: c.__name__)}
     items = [get_args(a)[0] for a in options if get_origin(a) in (tuple, list)]
     if items and isinstance(data, list) and (classes or not _forms(expected)):  # of objects, or of arrays
@@ -160,13 +155,13 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         nth = " ".join([*outer, f"[{header}]"])
         return tuple(decode(d, items[0], f"{nth} {i}", arrays) for i, d in enumerate(data, 1))
     number = isinstance(data, (int, float)) and not isinstance(data, bool) and (float, 0) in _forms(expected)
-    if any(is_module(a) for a in options) and not number:
+    if any(is_class(a, eqx.Module) for a in options) and not number:
         table: Any = {"kind": data} if isinstance(data, str) else data
-        opened = any(_is_abstract(a) for a in options)  # to classes that are registered
+        opened = any(is_abstract(a) for a in options)  # to classes that are registered
         _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
         choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
         # where no kind is given, the one class that is named by itself beside base classes, or the package's only one
-        plain = [a.__name__ for a in options if is_module(a) and not _is_abstract(a)]
+        plain = [a.__name__ for a in options if is_class(a, eqx.Module) and not is_abstract(a)]
         evident = plain if len(plain) == 1 else [name for name, c in classes.items() if is_own(c)]
         _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
         _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
@@ -180,7 +175,7 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
             return classes[kind](**keywords)
         except ValueError as error:
             raise ValueError(f"{where}: {error}" if where else str(error)) from None
-    if enums := [a for a in options if is_enum(a)]:
+    if enums := [a for a in options if is_class(a, enum.Enum)]:
         words = [member.value for member in enums[0]]
         listed = ", ".join(map(repr, words))
         _require(isinstance(data, str) and data in words, where, f"must be one of {listed}, got {_short(data)}")
@@ -220,20 +215,27 @@ def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray]
         _require(data["array"] in arrays, where, f"refers to the array {data['array']!r}, which is not there")
         a = arrays[data["array"]]
         _require((float, a.ndim) in forms, where, f"must be {_words(forms)}, got an array of shape {a.shape}")
-        leaves, kinds = a.ravel(), {float}
+        kinds = {float}
     else:
-        a, leaves, depth = data, _leaves(data), _depth(data)
-        kinds = {kind for kind, d in forms if d == depth and all(_fits(leaf, kind) for leaf in leaves)}
+        a = np.array(data, dtype=object)  # where lists are ragged, an array of lists
+        kinds = {kind for kind, depth in forms if depth == a.ndim and all(_fits(leaf, kind) for leaf in a.flat)}
         _require(kinds, where, f"must be {_words(forms)}, got {_short(data)}")
     if float in kinds:
-        bad = np.isnan if may_be_infinite(expected) else lambda x: ~np.isfinite(x)
-        beyond = any(isinstance(x, int) and math.isinf(_float(x)) for x in leaves)
-        _require(not (beyond or any(bad(_float(x)) for x in leaves)), where, f"must be finite, got {_short(data)}")
-        data = _nested(data, list, float) if a is data else a
-    takes_tuples = any(tuple in (a, get_origin(a)) for a in alternatives(expected))
-    if not isinstance(data, list) or (takes_tuples and len(leaves) <= _SMALL):
-        return _nested(data, tuple, lambda leaf: leaf)
-    return np.asarray(data)
+        try:
+            a = a if a.dtype.kind == "f" else a.astype(float)
+            bad = np.isnan(a) if may_be_infinite(expected) else ~np.isfinite(a)
+        except OverflowError:  # a whole number that no float holds
+            bad = np.True_
+        _require(not bad.any(), where, f"must be finite, got {_short(data)}")
+    takes_tuples = any(tuple in (option, get_origin(option)) for option in alternatives(expected))
+    if a.ndim and not (isinstance(data, list) and takes_tuples and a.size <= _SMALL):
+        return a if float in kinds else np.array(data)
+    return _plain(a.tolist())
+
+
+def _plain(data: Any) -> Any:
+    """Nested lists as tuples."""
+    return tuple(map(_plain, data)) if isinstance(data, list) else data
 
 
 def _parameters(function: Callable) -> dict[str, tuple[Any, Any]]:
@@ -272,7 +274,7 @@ def _forms(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
             forms.add((str, 0))
         elif get_origin(a) in (tuple, list):
             forms |= {(kind, depth + 1) for kind, depth in _forms(get_args(a)[0], within=True)}
-        elif isinstance(a, type) and issubclass(a, AbstractArray):
+        elif is_class(a, AbstractArray):
             axes = a.dim_str.split()
             forms |= {(float, len(axes)), (float, len([axis for axis in axes if not axis.startswith("*")]))}
     return forms
@@ -295,30 +297,6 @@ def _fits(leaf: Any, kind: type) -> bool:
     return isinstance(leaf, (int, float)) if kind is float else isinstance(leaf, int) and abs(leaf) < 2**63
 
 
-def _depth(data: Any) -> int:
-    """How deep lists are nested; −1 where they are ragged."""
-    if not isinstance(data, list):
-        return 0
-    depths, lengths = {_depth(d) for d in data}, {len(d) for d in data if isinstance(d, list)}
-    return -1 if len(depths) > 1 or len(lengths) > 1 or -1 in depths else 1 + max(depths, default=0)
-
-
-def _leaves(data: Any) -> list[Any]:
-    return [leaf for d in data for leaf in _leaves(d)] if isinstance(data, list) else [data]
-
-
-def _float(x: Any) -> float:
-    try:
-        return float(x)
-    except OverflowError:
-        return math.inf
-
-
-def _nested(data: Any, of_list: type, of_leaf: Callable[[Any], Any]) -> Any:
-    """Nested lists with another type for the lists and a function of the leaves."""
-    return of_list(_nested(d, of_list, of_leaf) for d in data) if isinstance(data, list) else of_leaf(data)
-
-
 def _close(word: str, words: Iterable[str]) -> str:
     close = difflib.get_close_matches(word, words, 1)
     return f", did you mean {close[0]!r}?" if close else "."
@@ -328,9 +306,8 @@ def _named(where: str, what: str) -> str:
     return f"{where}: {what}" if where else what.capitalize()
 
 
-def _short(data: Any, most: int = 60) -> str:
-    text = repr(data[: most + 1] if isinstance(data, str) else data)
-    return text if len(text) <= most else text[: most - 3] + "..."
+def _short(data: Any) -> str:
+    return shortened(repr(data[:61] if isinstance(data, str) else data), 60)
 
 
 def _require(condition: Any, where: str, message: str) -> None:

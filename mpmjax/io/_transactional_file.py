@@ -34,8 +34,7 @@ try:
 except ImportError:  # a system without POSIX's locks: two writers are not told from one
     fcntl = None
 
-_PAGE = 2**14
-BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."
+_BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."
 _NAMES = {"SIGINT": "interrupted", "SIGTERM": "told to end", "SIGHUP": "the terminal was closed"}
 _writing = threading.RLock()
 _reports: list[Callable[[], str]] = []
@@ -161,21 +160,26 @@ class StagedFile(io.RawIOBase):
     it drops what was not committed."""
 
     def __init__(self, path: Path):
-        """Open a file and lock it for writing; a BlockingIOError if another writer is at it. The lock goes with the
-        process, however that ends; readers are free."""
-        self._raw = open(path, "r+b", buffering=0)  # noqa: SIM115 (closed by `close`)
+        """Open a file and lock it for writing; `ValueError`s say why not. The lock goes with the process, however that
+        ends; readers are free."""
         try:
-            _lock(self._raw.fileno(), shared=False)
-        except BaseException:
-            self._raw.close()
-            raise
+            self._raw = open(path, "r+b", buffering=0)  # noqa: SIM115 (closed by `close`)
+            try:
+                _lock(self._raw.fileno(), shared=False)
+            except BaseException:
+                self._raw.close()
+                raise
+        except BlockingIOError:
+            raise ValueError(_BUSY.format(path)) from None
+        except OSError as error:
+            raise ValueError(f"{path} cannot be written ({reason(error)}): name a place that can be.") from None
         self._at = 0
         self._drop()
 
     def _drop(self) -> None:
         """Forget what is staged."""
         self._size = self._base = self._length = os.fstat(self._raw.fileno()).st_size
-        self._pages: dict[int, bytearray] = {}  # by their numbers; where there is none, the disk's bytes up to `_base`
+        self._writes: list[tuple[int, bytes]] = []  # in their order, over the disk's bytes up to `_base`, then zeros
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Move to a position."""
@@ -187,54 +191,45 @@ class StagedFile(io.RawIOBase):
         view, begin = memoryview(into).cast("B"), self._at
         end = self._at = begin + len(view)
         view[:] = self._stored(begin, min(end, self._base) - begin).ljust(len(view), b"\0")
-        for number in _pages_of(begin, end) if self._pages else ():
-            if number in self._pages:
-                low, high = max(begin, number * _PAGE), min(end, (number + 1) * _PAGE)
-                view[low - begin : high - begin] = self._pages[number][low - number * _PAGE : high - number * _PAGE]
+        for at, data in self._writes:
+            low, high = max(begin, at), min(end, at + len(data))
+            if low < high:
+                view[low - begin : high - begin] = data[low - at : high - at]
         return len(view)
 
     def write(self, data: Any) -> int:
         """Stage bytes at the position."""
-        view, begin = memoryview(data).cast("B"), self._at
-        end = self._at = begin + len(view)
-        for number in _pages_of(begin, end):
-            low, high = max(begin, number * _PAGE), min(end, (number + 1) * _PAGE)
-            self._page(number)[low - number * _PAGE : high - number * _PAGE] = view[low - begin : high - begin]
-        self._length = max(self._length, end) if len(view) else self._length
-        return len(view)
+        staged = bytes(memoryview(data).cast("B"))
+        if staged:
+            self._writes.append((self._at, staged))
+            self._at += len(staged)
+            self._length = max(self._length, self._at)
+        return len(staged)
 
     def truncate(self, size: int | None = None) -> int:
         """Stage the file's length."""
         size = self._at if size is None else size
         self._base, self._length = min(self._base, size), size
-        self._pages = {number: page for number, page in self._pages.items() if number * _PAGE < size}
-        if (last := self._pages.get(size // _PAGE)) is not None:
-            last[size % _PAGE :] = bytes(_PAGE - size % _PAGE)
+        self._writes = [(at, data[: size - at]) for at, data in self._writes if at < size]
         return size
-
-    def _page(self, number: int) -> bytearray:
-        """A page to be changed."""
-        if number not in self._pages:
-            stored = self._stored(number * _PAGE, min(_PAGE, self._base - number * _PAGE))
-            self._pages[number] = bytearray(stored.ljust(_PAGE, b"\0"))
-        return self._pages[number]
 
     def commit(self) -> None:
         """Bring the file up to date. If the disk refuses, an OSError: the file is what it was, and what was staged
         is lost."""
         with undisturbed():
-            for number in _pages_of(self._base, min(self._length, self._size)):
-                self._page(number)  # what was cut off and grew again is zero
-            order = sorted(self._pages, key=lambda number: (number * _PAGE < self._size, number))
-            parts = [(n * _PAGE, self._pages[n][: self._length - n * _PAGE]) for n in order]
-            before = [(at, self._stored(at, min(len(data), self._size - at))) for at, data in parts if at < self._size]
+            size, grown = self._size, bytearray(max(0, self._length - self._size))
+            self.seek(size)
+            self.readinto(grown)  # what lengthens the file comes first: this is where room runs out
+            inside = [(self._base, bytes(max(0, min(self._length, size) - self._base)))]  # cut off, and grown again
+            inside += [(at, data[: size - at]) for at, data in self._writes if at < size]
+            before = [(at, self._stored(at, len(data))) for at, data in inside]
             try:
-                for at, data in parts:
+                for at, data in [(size, grown), *inside]:
                     self._put(at, data)
                 self._raw.truncate(self._length)
             except BaseException:
                 with suppress(OSError):
-                    self._raw.truncate(self._size)
+                    self._raw.truncate(size)
                     for at, data in before:
                         self._put(at, data)
                 raise
@@ -275,15 +270,15 @@ class StagedFile(io.RawIOBase):
             view = view[self._raw.write(view) :]
 
 
-def _pages_of(begin: int, end: int) -> range:
-    """The pages that hold the bytes from `begin` up to `end`."""
-    return range(begin // _PAGE, -(-end // _PAGE) if end > begin else begin // _PAGE)
-
-
 def require_no_writer(path: Path) -> None:
-    """Raise `BlockingIOError` if a `StagedFile` is open on that file, here or in another process."""
-    with open(path, "rb", buffering=0) as raw:
-        _lock(raw.fileno(), shared=True)
+    """Raise `ValueError` if a `StagedFile` is open on that file, here or in another process."""
+    try:
+        with open(path, "rb", buffering=0) as raw:
+            _lock(raw.fileno(), shared=True)
+    except BlockingIOError:
+        raise ValueError(_BUSY.format(path)) from None
+    except OSError:
+        return  # whoever opens it next says why it cannot
 
 
 def _lock(file: int, *, shared: bool) -> None:
@@ -309,16 +304,6 @@ def _lock(file: int, *, shared: bool) -> None:
         raise
     except OSError:
         return
-
-
-def staged_file(path: Path) -> StagedFile:
-    """The file, locked and ready to be changed; `ValueError`s say why not."""
-    try:
-        return StagedFile(path)
-    except BlockingIOError:
-        raise ValueError(BUSY.format(path)) from None
-    except OSError as error:
-        raise ValueError(f"{path} cannot be written ({reason(error)}): name a place that can be.") from None
 
 
 class ReplacedFile:
@@ -359,7 +344,7 @@ class ReplacedFile:
 
 def _locked(path: Path) -> StagedFile | None:
     """The file, open and locked; None on a system without locks, where no file can replace an open one."""
-    held = staged_file(path)
+    held = StagedFile(path)
     if fcntl is not None:
         return held
     held.close()

@@ -206,7 +206,7 @@ class Run(eqx.Module):
             raise ValueError("This run saved no frames: pass save_every to simulate.")
         if not -len(self) <= i < len(self):
             raise IndexError(f"The run has {len(self)} frames, there is no frame {i}.")
-        return with_state(self.final, jax.tree.map(lambda a: a[i], self.frames))
+        return with_state(self.final, _row(self.frames, i % len(self)))
 
     def forces(self) -> Forces:
         """The mean force and torque on each collider over the steps between one saved frame and the next.
@@ -235,6 +235,7 @@ class Run(eqx.Module):
             )
         return self._mean_forces(self.boundary_impulse)
 
+    @eqx.filter_jit
     def _mean_forces(self, impulses: Impulses) -> Forces:
         times, at = self.times, self.method.force_at()
         between = (times[1:] - times[:-1])[:, None, None]
@@ -244,3 +245,8 @@ class Run(eqx.Module):
 
     def __len__(self) -> int:
         return 0 if self.frames is None else int(np.shape(self.steps)[0])
+
+
+@jax.jit
+def _row(frames: State, i: Int[Array, ""]) -> State:
+    return jax.tree.map(lambda a: a[i], frames)

@@ -372,7 +372,7 @@ def run_to(
 ) -> Run:
     """The run that ended in this state at step `step`; `saved` are its fields that hold more than its end."""
     dtype = particles.x.dtype
-    saved = {"steps": jnp.zeros((0,), dtype), "frames": None, "observed": None} | saved
+    saved = {"steps": jax.device_put(np.zeros((0,), dtype)), "frames": None, "observed": None} | saved
     return Run(
         scene=scene,
         method=method,

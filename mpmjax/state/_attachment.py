@@ -4,12 +4,13 @@ step: how the nodes move them, and how forces on them reach the nodes."""
 import abc
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
 from mpmjax._types import Array, Float, Int, Matrix, NodeVector, Scalar
-from mpmjax.checks import is_traced, require, require_fields, require_positive, require_that, warn
+from mpmjax.checks import is_traced, require, require_fields, require_positive, require_that, shape_of, warn
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.geometry import AbstractRegion, surface_pieces
 from mpmjax.material import AbstractLaw
@@ -57,16 +58,16 @@ class AttachedPoints(AbstractPlace):
 
     def __check_init__(self):
         require_fields(self)
-        s = jnp.shape(jnp.asarray(self.particle))
-        rows = [jnp.shape(jnp.asarray(a)) for a in (self.offset, self.place, self.area) if a is not None]
+        s = shape_of(self.particle)
+        rows = [shape_of(a) for a in (self.offset, self.place, self.area) if a is not None]
         require(
-            len(s) == 1 and jnp.shape(jnp.asarray(self.weight)) == s and all(r[:1] == s for r in rows) and s[0] > 0,
+            len(s) == 1 and shape_of(self.weight) == s and all(r[:1] == s for r in rows) and s[0] > 0,
             f"AttachedPoints need one row a point in each of their arrays, got {s} and {rows}.",
         )
 
     @property
     def dim(self) -> int:
-        return jnp.shape(jnp.asarray(self.offset))[1]
+        return shape_of(self.offset)[1]
 
     def attached(self, particles: Particles) -> "AttachedPoints":
         del particles
@@ -134,18 +135,11 @@ class Patch(AbstractPlace):
         particle = _nearest(x, middle, apart, self)
         axis = np.abs(area).argmax(axis=1)
         facing = 2 * axis + (np.take_along_axis(area, axis[:, None], axis=1)[:, 0] > 0)
-        _, piece = np.unique(np.stack([particle, facing]), axis=1, return_inverse=True)
-
-        def summed(a: np.ndarray) -> np.ndarray:
-            total = np.zeros((piece.max() + 1, *a.shape[1:]))
-            np.add.at(total, piece.reshape(-1), a)
-            return total
-
-        whole = summed(weight)
-        middle = summed(weight[:, None] * middle) / whole[:, None]
-        first = np.zeros(len(whole), int)
-        first[piece.reshape(-1)] = particle
-        return _attached(particles, first, middle, whole, summed(area))
+        one, piece = np.unique(np.stack([particle, facing]), axis=1, return_inverse=True)
+        summed = np.zeros((one.shape[1], 1 + 2 * self.dim))
+        np.add.at(summed, piece.reshape(-1), np.column_stack([weight, weight[:, None] * middle, area]))
+        whole, moment, area = np.split(summed, [1, 1 + self.dim], axis=1)
+        return _attached(particles, one[0], moment / whole, whole[:, 0], area)
 
 
 class PointsAt(AbstractPlace):
@@ -161,10 +155,10 @@ class PointsAt(AbstractPlace):
 
     def __check_init__(self):
         require_fields(self)
-        shape = jnp.shape(jnp.asarray(self.positions))
+        shape = shape_of(self.positions)
         require(len(shape) == 2 and shape[0] > 0, f"PointsAt need positions of shape (s, d), got {shape}.")
         require(
-            self.weights is None or jnp.shape(jnp.asarray(self.weights)) == shape[:1],
+            self.weights is None or shape_of(self.weights) == shape[:1],
             f"PointsAt need one weight a position, got {self.weights}.",
         )
         if self.weights is not None:
@@ -176,13 +170,13 @@ class PointsAt(AbstractPlace):
 
     @property
     def dim(self) -> int:
-        return jnp.shape(jnp.asarray(self.positions))[1]
+        return shape_of(self.positions)[1]
 
     def attached(self, particles: Particles) -> AttachedPoints:
         x, apart = _positions(particles, self)
-        places = np.asarray(self.positions, float)
-        weight = np.full(len(places), 1 / len(places)) if self.weights is None else np.asarray(self.weights, float)
-        return _attached(particles, _nearest(x, places, apart, self), places, weight, None)
+        at = np.asarray(self.positions, float)
+        weight = np.full(len(at), 1 / len(at)) if self.weights is None else np.asarray(self.weights, float)
+        return _attached(particles, _nearest(x, at, apart, self), at, weight, None)
 
 
 def _positions(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, float]:
@@ -198,27 +192,27 @@ def _positions(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, 
     return np.asarray(particles.x, float), float(np.median(np.asarray(particles.volume)) ** (1 / particles.dim))
 
 
-def _nearest(x: np.ndarray, places: np.ndarray, apart: float, place: AbstractPlace) -> np.ndarray:
-    """The number of the particle nearest to each place."""
-    far, particle = KDTree(x).query(places)
+def _nearest(x: np.ndarray, positions: np.ndarray, apart: float, place: AbstractPlace) -> np.ndarray:
+    """The number of the particle nearest to each position."""
+    far, particle = KDTree(x).query(positions)
     require(
         far <= _FAR * apart,
-        f"The {type(place).__name__} has a point at {places[far.argmax()]} m, {far.max():.3g} m off the nearest "
+        f"The {type(place).__name__} has a point at {positions[far.argmax()]} m, {far.max():.3g} m off the nearest "
         "particle: place it on the body.",
     )
     return np.asarray(particle)
 
 
 def _attached(
-    particles: Particles, particle: np.ndarray, places: np.ndarray, weight: np.ndarray, area: np.ndarray | None
+    particles: Particles, particle: np.ndarray, positions: np.ndarray, weight: np.ndarray, area: np.ndarray | None
 ) -> AttachedPoints:
-    """Points at places, with their undeformed offsets and areas (Nanson's formula): A = Fᵀ a / det F."""
+    """Points at positions [m], with their undeformed offsets and areas (Nanson's formula): A = Fᵀ a / det F."""
     dtype = particles.x.dtype
     require(
         particles.count < 2 ** (jnp.finfo(dtype).nmant + 1),
         f"{dtype} counts particles exactly only below {2 ** (jnp.finfo(dtype).nmant + 1)}: use float64.",
     )
-    offset = places - np.asarray(particles.x, float)[particle]
+    offset = positions - np.asarray(particles.x, float)[particle]
     kept = [np.asarray(F, float) for F in particles.deformations if F is not None and F.ndim == 3]
     if len(kept) == len(particles.deformations):
         F = np.concatenate(kept)[particle]
@@ -226,8 +220,8 @@ def _attached(
         if area is not None:
             turned: np.ndarray = (np.swapaxes(F, 1, 2) @ area[:, :, None])[:, :, 0] / np.linalg.det(F)[:, None]
             area, weight = turned, np.sqrt((turned**2).sum(axis=1))
-    of_points = (jnp.asarray(a, dtype) for a in (particle, offset, weight, places))
-    return AttachedPoints(*of_points, area=None if area is None else jnp.asarray(area, dtype))
+    arrays = (particle, offset, weight, positions, area)
+    return AttachedPoints(*jax.device_put([a if a is None else np.asarray(a, dtype) for a in arrays]))
 
 
 class LoadedPoints(eqx.Module):

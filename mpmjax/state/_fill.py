@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Point, Scalar
-from mpmjax.checks import checked, coordinates, require, require_memory, require_positive, shortened
+from mpmjax.checks import checked, coordinates, is_traced, require, require_memory, require_positive, shortened
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractMotion, AbstractRegion, Box, box_cells, inside_parts
 from mpmjax.state._particles import Particles
@@ -72,11 +72,7 @@ def fill(
         )
         counts = np.full(d, root)
     else:
-        counts = np.asarray(particles_per_cell)
-        require(
-            counts.shape == (d,) and (counts >= 1).all() and counts.dtype.kind == "i",
-            f"particles_per_cell must be one or {d} positive whole numbers, got {particles_per_cell}.",
-        )
+        counts = _counts("particles_per_cell must be one or", particles_per_cell, d)
     field = _velocity(velocity, d)
     lower, upper = region.bounds()
     require(lower.shape == (d,), f"The region is {lower.size}-dimensional, the grid {d}-dimensional.")
@@ -135,11 +131,7 @@ def fill_mapped(
     """
     d, precision = box.dim, _precision(dtype)
     require_positive("density [kg/m^d]", density)
-    number = np.asarray(counts)
-    require(
-        number.shape == (d,) and number.dtype.kind == "i" and (number >= 1).all(),
-        f"counts must be {d} positive whole numbers, got {counts}.",
-    )
+    number = _counts("counts must be", counts, d)
     field = _velocity(velocity, d)
     lower, upper = box.bounds()
     require(np.isfinite(lower) & np.isfinite(upper), "A box to map must be finite.")
@@ -151,7 +143,7 @@ def fill_mapped(
     nodes, weights = np.polynomial.legendre.leggauss(3)
     offsets = np.array(list(itertools.product(nodes / 2, repeat=d))) * size
     share = np.array(list(itertools.product(weights / 2, repeat=d))).prod(axis=1)
-    points = jnp.asarray((centres[:, None] + offsets).reshape(-1, d))
+    points = (centres[:, None] + offsets).reshape(-1, d)
     mapped, slopes = eqx.filter_jit(jax.vmap(lambda xi: (mapping(xi), jax.jacfwd(mapping)(xi))))(points)
     require(mapped.shape == points.shape, f"A map must take {d} coordinates to {d}, got {mapped.shape[1:]} of them.")
     jacobian = np.linalg.det(np.asarray(slopes, float))
@@ -172,6 +164,13 @@ def _precision(dtype: type | str | None) -> Any:
         precision = None
     require(precision in (jnp.float32, jnp.float64), f"dtype must be float32 or float64, got {shortened(repr(dtype))}.")
     return precision
+
+
+def _counts(what: str, counts: tuple[int, ...] | list[int], d: int) -> np.ndarray:
+    number = np.asarray(counts)
+    whole = number.shape == (d,) and number.dtype.kind == "i" and (number >= 1).all()
+    require(whole, f"{what} {d} positive whole numbers, got {counts}.")
+    return number
 
 
 def _velocity(velocity: Velocity | None, d: int) -> Velocity:
@@ -208,8 +207,7 @@ def _cut_cells(region: AbstractRegion, size: np.ndarray) -> tuple[np.ndarray, np
     shifts = [step * np.eye(share.ndim, dtype=int)[a] for a in range(share.ndim) for step in (-1, 1)]
     beside = np.stack([np.roll(padded, tuple(-shift), axis=tuple(range(share.ndim)))[middle] for shift in shifts])
     small &= beside.max(axis=0) >= _SMALL
-    place = np.argwhere(small)
-    target = tuple((place + np.array(shifts)[beside.argmax(axis=0)[small]]).T)
+    target = tuple((np.argwhere(small) + np.array(shifts)[beside.argmax(axis=0)[small]]).T)
     total, moment = np.where(small, 0, share), np.where(small[..., None], 0, share[..., None] * centroid)
     np.add.at(total, target, share[small])
     np.add.at(moment, target, share[small][:, None] * centroid[small])
@@ -219,11 +217,12 @@ def _cut_cells(region: AbstractRegion, size: np.ndarray) -> tuple[np.ndarray, np
 
 def _particles(x: np.ndarray, volume: np.ndarray, density: Scalar, velocity: Velocity, dtype: Any) -> Particles:
     """Particles at x [m], (p, d), of volumes [m^d], (p,), alike in density."""
-    places, volumes, C = jnp.asarray(x, dtype), jnp.asarray(volume, dtype), None
+    x, volume, C = np.asarray(x, dtype), np.asarray(volume, dtype), None
+    xp = jnp if is_traced((density, velocity)) else np  # each operation of JAX by itself is a program to compile
     if callable(velocity):
-        v, C = eqx.filter_jit(jax.vmap(lambda y: (velocity(y), jax.jacfwd(velocity)(y))))(places)
-        require(v.shape == places.shape, f"velocity must give {places.shape[1]} components, got {v.shape[1:]}.")
+        v, C = eqx.filter_jit(jax.vmap(lambda y: (velocity(y), jax.jacfwd(velocity)(y))))(x)
+        require(v.shape == x.shape, f"velocity must give {x.shape[1]} components, got {v.shape[1:]}.")
         v, C = v.astype(dtype), C.astype(dtype)
     else:
-        v = jnp.broadcast_to(jnp.asarray(velocity, dtype), places.shape)
-    return Particles(x=places, v=v, mass=jnp.asarray(density, dtype) * volumes, volume=volumes, C=C)
+        v = xp.broadcast_to(xp.asarray(velocity, dtype), x.shape)
+    return Particles(*jax.device_put((x, v, xp.asarray(density, dtype) * volume, volume)), C=C)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector, ParticleVector, Point, Scalar, components
-from mpmjax.checks import require, require_fields, require_that
+from mpmjax.checks import require, require_fields, require_that, shape_of
 from mpmjax.discretisation import Stencil
 from mpmjax.geometry import (
     AbstractMotion,
@@ -233,7 +233,7 @@ class Spring(AbstractLoad):
     def check(self, dim: int) -> None:
         AbstractLoad.check(self, dim)
         for name, value in (("stiffness", self.stiffness), ("damping", self.damping)):
-            shape = () if value is None else jnp.shape(jnp.asarray(value))
+            shape = () if value is None else shape_of(value)
             require(shape in ((), (dim,)), f"A Spring's {name} must be a number or {dim} of them, got {value}.")
         require(
             self.motion is None or self.motion.dim == dim,
@@ -357,7 +357,7 @@ class Couple(AbstractLoad):
         require_fields(self)
         require_some("Couple's total [N m]", self.total)
         if isinstance(self.on, AttachedPoints):
-            count = jnp.shape(jnp.asarray(self.on.particle))[0]
+            count = shape_of(self.on.particle)[0]
             require(count >= self.on.dim, f"A Couple needs {self.on.dim} points at least, got {count}.")
 
     def check(self, dim: int) -> None:

@@ -196,12 +196,12 @@ def join(*sets: Particles, material: int | None = None) -> Particles:
         )
         first[material] += [member for members in more for member in members]
         materials = first
-    in_order = [member for members in materials for member in members]
-    arrays: dict[str, Any] = {
-        name: jnp.concatenate([getattr(q, name)[slice(*group.rows)] for q, group in in_order])
-        for name in ("x", "v", "mass", "volume", "C", "X")
-        if getattr(sets[0], name) is not None
-    }
+    xp: Any = jnp if is_traced(sets) else np  # each operation of JAX by itself is a program to compile
+    arrays: dict[str, Any] = {}
+    for name in ("x", "v", "mass", "volume", "C", "X"):
+        if getattr(sets[0], name) is not None:
+            each = [xp.asarray(getattr(q, name))[slice(*group.rows)] for members in materials for q, group in members]
+            arrays[name] = jax.device_put(xp.concatenate(each))
     counts = tuple(sum(group.rows[1] - group.rows[0] for _, group in members) for members in materials)
     return Particles(
         **arrays,
@@ -216,7 +216,10 @@ def of_one_material(parts: Sequence[Any]) -> Any:
     they are of several laws."""
     kinds = {(jax.tree.structure(part), tuple(leaf.shape[1:] for leaf in jax.tree.leaves(part))) for part in parts}
     require(len(kinds) == 1, "Joined particles of one material must have been prepared for one law.")
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    if len(parts) == 1:
+        return parts[0]
+    xp: Any = jnp if is_traced(parts) else np
+    return jax.tree.map(lambda *leaves: jax.device_put(xp.concatenate(leaves)), *parts)
 
 
 class State(eqx.Module):

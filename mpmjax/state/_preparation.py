@@ -70,7 +70,7 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     p, d = particles.count, particles.dim
     require(d == scene.grid.dim, f"The particles are {d}-dimensional, the grid {scene.grid.dim}-dimensional.")
     requirements((scene, particles))
-    several = len(scene.laws) > 1
+    scene, several = canonical(scene, particles.x.dtype), len(scene.laws) > 1
     require(
         not several or len(particles.sizes) == len(scene.laws),
         f"The scene has {len(scene.laws)} laws, so the particles must be {len(scene.laws)} sets joined by mpmjax.join, "
@@ -85,8 +85,12 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
         not scene.total or particles.X is not None or first,
         "In the total description particles with an F need the X from which it is measured: give X, or drop F.",
     )
-    materials = [_prepared(law, group, particles) for law, group in zip(scene.laws, particles.groups, strict=True)]
-    C = jnp.zeros((p, d, d), particles.x.dtype) if particles.C is None else particles.C
+    # of known numbers NumPy makes arrays: each operation of JAX by itself is a program to compile
+    xp: Any = jnp if is_traced((scene, particles)) else np
+    materials = [_prepared(law, group, particles, xp) for law, group in zip(scene.laws, particles.groups, strict=True)]
+    C = particles.C
+    if scene.keeps_gradient and C is None:
+        C = jax.device_put(xp.zeros((p, d, d), particles.x.dtype))
     prepared = replace(
         particles,
         deformations=tuple(deformation for deformation, _ in materials),
@@ -103,14 +107,13 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
         f"take a smaller shape than {scene.grid.shape}, or fewer particles_per_cell.",
         device=True,
     )
-    typed = canonical(scene, particles.x.dtype)
     if not is_traced((scene, prepared)):
-        _check_placement(typed, prepared)
+        _check_placement(scene, prepared)
         if first:
-            warn_of_setup(typed, prepared)
+            warn_of_setup(scene, prepared)
     if not scene.keeps_gradient or particles.C is not None or moves_as_one(particles):
         return prepared
-    return replace(prepared, C=velocity_gradient(typed, prepared))
+    return replace(prepared, C=velocity_gradient(scene, prepared))
 
 
 def _check_loads(scene: Scene, particles: Particles) -> None:
@@ -139,8 +142,8 @@ def _check_loads(scene: Scene, particles: Particles) -> None:
             )
 
 
-def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Array, Any]:
-    """Deformation and history of one material's particles."""
+def _prepared(law: AbstractLaw, group: Group, particles: Particles, xp: Any) -> tuple[Array, Any]:
+    """Deformation and history of one material's particles, of which `xp`, NumPy or JAX, makes what is missing."""
     start, stop = group.rows
     leaves = jax.tree.leaves(law, is_leaf=is_foreign)  # the numbers of networks and the like are their own
     shapes, fitting = {jnp.shape(a) for a in leaves if eqx.is_array_like(a)}, {(), (1,), (stop - start,)}
@@ -151,13 +154,14 @@ def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Arr
         "within the law.",
     )
     kept = law.measure
-    undeformed = jnp.asarray(kept.undeformed(particles.dim), particles.x.dtype)
-    shape = (stop - start, *undeformed.shape)
-    stored = jnp.broadcast_to(undeformed, shape) if group.stored is None else group.stored
+    undeformed = kept.undeformed(particles.dim)
+    shape, stored = (stop - start, *undeformed.shape), group.stored
+    if stored is None:
+        stored = jax.device_put(xp.broadcast_to(undeformed.astype(particles.x.dtype), shape))
     require(stored.shape == shape, f"{law.title()} needs {kept.symbol} of shape {shape}, got {stored.shape}.")
     if group.history is not None and law.remembers(group.history, stored):
         return stored, group.history
-    initial = law.initial_history(components(stored))
+    initial = None if law.remembers(None, stored) else _initial_history(law, stored)
     require(
         group.history is None or initial is None,
         f"{law.title()} needs a history of its own, got {type(group.history).__name__}: drop it to start anew.",
@@ -187,13 +191,20 @@ def is_foreign(node: Any) -> bool:
 
 
 @eqx.filter_jit
-def _admissible(scene: Scene, particles: Particles) -> list[Bool[Array, "q"]]:
-    """Whether its law allows the deformation of each particle, one array (q,) a material."""
-    return [points.is_admissible(points.deformation) for points in scene.material_points(particles)]
+def _initial_history(law: AbstractLaw, stored: Array) -> Any:
+    return law.initial_history(components(stored))
+
+
+@eqx.filter_jit
+def _fits(scene: Scene, particles: Particles) -> tuple[Bool[Array, "p"], list[Bool[Array, "q"]]]:
+    """Whether each particle's stencil lies in the window, and whether its law allows its deformation, one array (q,) a
+    material."""
+    inside = in_window(scene.kernel, scene.grid, scene.window(particles), scene.anchor(particles))
+    return inside, [points.is_admissible(points.deformation) for points in scene.material_points(particles)]
 
 
 def _check_placement(scene: Scene, particles: Particles) -> None:
-    place = scene.anchor(particles)
+    place = np.asarray(scene.anchor(particles))
     require_finite("Particle positions", particles.x)
     require_finite("Particle velocities", particles.v)
     for boundary in scene.boundary:
@@ -205,13 +216,17 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
                 f"Particles must lie {keep} the {name} at {wall.position:g} on axis {wall.axis}, but particle "
                 f"{int(np.argmax(beyond))} does not: move it or change the plane's keep.",
             )
-    inside = np.ones(particles.count, bool)
-    if scene.total or not scene.moving_mirrors:  # else the grid is where the time says
-        inside = np.asarray(in_window(scene.kernel, scene.grid, scene.window(particles), place))
-    if not inside.all():
+    bare = scene
+    if scene.volume is None:  # scenes with other boundaries and loads share the program then
+        bare = Scene(
+            scene.grid, scene.material, kernel=scene.kernel, description=scene.description, bodies=scene.bodies
+        )
+    inside, admissible = jax.tree.map(np.asarray, _fits(bare, particles))
+    at_rest = scene.total or not scene.moving_mirrors  # else the grid is where the time says
+    if at_rest and not inside.all():
         first = int(np.argmin(inside))
         raise ValueError(
-            f"Every particle's stencil must lie in the window; particle {first} at {np.asarray(place[first])} and "
+            f"Every particle's stencil must lie in the window; particle {first} at {place[first]} and "
             f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
         )
     for body in scene.rigid_bodies:
@@ -223,10 +238,10 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"A Rigid body's particles must not lie {'at one point' if particles.dim < 3 else 'on one line'}, by which "
             f"nothing says how it turns: give material {body.number} more of them.",
         )
-    for law, group, allowed in zip(scene.laws, particles.groups, _admissible(scene, particles), strict=True):
+    for law, group, allowed in zip(scene.laws, particles.groups, admissible, strict=True):
         kept, first = law.measure, int(np.argmin(allowed)) + group.rows[0]
         require(
-            np.asarray(allowed),
+            allowed,
             f"{type(law).__name__} does not allow the {kept.symbol} of particle {first} (most laws need "
             f"{kept.volume} > 0): start from an admissible one.",
         )

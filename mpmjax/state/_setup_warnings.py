@@ -5,16 +5,18 @@ still reach is not.
 """
 
 import itertools
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Int, ParticleVector
+from mpmjax._types import Array, Bool, Float, Int, ParticleVector
 from mpmjax.boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.checks import warn
-from mpmjax.discretisation import Grid
+from mpmjax.discretisation import BSpline, Grid
+from mpmjax.material import AbstractLaw
 from mpmjax.state._particles import Particles
 from mpmjax.state._scene import Scene
 
@@ -31,7 +33,8 @@ _MOST_ROUNDING = 2.0**-12
 def warn_of_setup(scene: Scene, particles: Particles) -> None:
     """Warn of walls and colliders that lie over the body, of grips and colliders that touch nothing, of thin bodies;
     the floats of the scene are arrays."""
-    grid, boundary, total = scene.grid.with_layers(1), scene.boundary, scene.total  # all bodies' nodes coincide
+    boundary, total = scene.boundary, scene.total
+    grid = jax.tree.map(np.asarray, scene.grid.with_layers(1))  # all bodies' nodes coincide
     dx, free, d = float(grid.spacing), np.asarray(grid.periodic), grid.dim
     x, volume = np.asarray(particles.x), np.asarray(particles.volume)
     resting = tuple(c.rests(total=total) and not grid.follow for c in boundary)
@@ -43,7 +46,7 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
     for number, (condition, inside, mask) in enumerate(zip(boundary, within, touched, strict=True), 1):
         name, walls = f"{type(condition).__name__} (boundary {number})", condition.walls()
         if inside is None:
-            nearest = np.asarray(_nearest(condition, grid, particles.volume))
+            nearest = _nearest(condition, grid, volume)
             beyond = [wall.inward * (x[:, wall.axis] - wall.position) < nearest for wall in walls]
             inside = np.any(beyond, axis=0).sum()
         if inside and condition.pushes:
@@ -60,12 +63,12 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
         if mask is not None:
             may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
             if not may_meet:  # only the nodes in a particle's stencil
-                base = np.asarray(scene.kernel.base(particles.x / grid.spacing)) - np.asarray(grid.window(particles.x))
+                first_nodes = np.asarray(_base(scene.kernel, grid, particles.x))
                 reached = np.zeros(grid.shape, dtype=bool)
                 for offset in itertools.product(range(scene.kernel.order + 1), repeat=d):
-                    reached[tuple(((base + offset).astype(int) % grid.shape).T)] = True
+                    reached[tuple(((first_nodes + offset) % grid.shape).T)] = True
                 mask = np.asarray(mask)[reached.reshape(-1)]
-            if not mask.any():
+            if not np.asarray(mask).any():
                 where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
                 warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")
             continue
@@ -121,9 +124,8 @@ def warn_of_rounding(grid: Grid, x: ParticleVector, before: ParticleVector | Non
 def warn_of_crowding(scene: Scene, particles: Particles) -> None:
     """Warn of particles that take much more space than there is, after a run in the updated description. A law sees the
     volume of each particle by itself, and not that they crowd."""
-    groups = zip(scene.laws, particles.groups, strict=True)
-    ratio = np.concatenate([np.asarray(law.compaction(g.history)) * np.asarray(g.volume_ratio()) for law, g in groups])
-    volume, side = np.asarray(particles.volume, float) * ratio, float(particles.volume.max()) ** (1 / particles.dim)
+    volume = np.asarray(particles.volume, float) * np.concatenate(_ratios(scene.laws, particles))
+    side = float(np.asarray(particles.volume).max()) ** (1 / particles.dim)
     for offset in (0.0, 0.5):  # a layer between two rows of nodes shows less
         filled = _filled(np.asarray(particles.x), volume, max(float(scene.grid.spacing), 2 * side), offset)
         beyond = 0.0 if filled is None else np.maximum(filled[0] - _CROWDED, 0).sum() / filled[0].sum()
@@ -134,6 +136,19 @@ def warn_of_crowding(scene: Scene, particles: Particles) -> None:
                 "pressures are wrong. Take a shorter step, and around what flows a SeparatingBox or ContactPlanes."
             )
             return
+
+
+@eqx.filter_jit
+def _base(kernel: BSpline, grid: Grid, x: ParticleVector) -> Int[Array, "p d"]:
+    """The first node of each particle's stencil, counted from the window's."""
+    return kernel.base(x / grid.spacing).astype(jnp.int32) - grid.window(x)
+
+
+@eqx.filter_jit
+def _ratios(laws: tuple[AbstractLaw, ...], particles: Particles) -> list[Float[Array, "q"]]:
+    """The volume that the particles of each material take, over the undeformed one."""
+    groups = zip(laws, particles.groups, strict=True)
+    return [law.compaction(group.history) * group.volume_ratio() for law, group in groups]
 
 
 def _probe(
@@ -163,10 +178,10 @@ def _probe(
     return [covered(b) for b in boundary], [touched(b) if r else None for b, r in zip(boundary, resting, strict=True)]
 
 
-def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Array) -> Array:
+def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Any) -> Any:
     """How near particles may start to what holds or pushes them [m], (p,): to what pushes their faces, a quarter of
     their width."""
-    return volume ** (1 / grid.dim) / 4 if boundary.pushes else jnp.full_like(volume, -ON_THE_WALL * grid.spacing)
+    return volume ** (1 / grid.dim) / 4 if boundary.pushes else 0 * volume - ON_THE_WALL * grid.spacing
 
 
 def _filled(
