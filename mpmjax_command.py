@@ -1,16 +1,358 @@
-"""Where the shell's `mpmjax` begins. Outside of the package, whose import takes seconds in which Ctrl-C should end the
-command as quietly as SIGTERM does, and not with a traceback of what was being imported."""
+"""The shell's `mpmjax`: its options, and what is refused before the package is imported.
 
+It stands outside of the package, whose import takes a second: who asks for help or errs waits less, and meanwhile
+Ctrl-C ends the command as quietly as SIGTERM does, not with a traceback of what was being imported.
+"""
+
+import importlib
+import importlib.util
+import re
 import signal
+import sys
+import tomllib
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import wraps
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(
+    help="A differentiable Material Point Method.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
+)
+_handles_signals = False
 
 
 def main() -> None:
     """Entry point of the `mpmjax` command."""
+    global _handles_signals
+    _handles_signals = True
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from mpmjax.cli import main as command  # which sets its own handlers
+    app()
 
-    command()
+
+@contextmanager
+def _package(imports: Sequence[str] | None = None) -> Iterator[Any]:
+    """`mpmjax.cli` with 64-bit numbers, after the import of modules, each by its name or the path of its .py file:
+    files know what these register from then on."""
+    for name in imports or ():
+        if name.endswith(".py"):
+            _require(Path(name).is_file(), f"--import: there is no file {name}.")
+        else:
+            there = importlib.util.find_spec(name.partition(".")[0])
+            _require(there, f"--import: Python finds no module {name!r}; name its .py file instead.")
+    import jax
+
+    from mpmjax import cli, io
+
+    if _handles_signals:
+        io.end_on_signals()
+    with jax.enable_x64(True):
+        for name in imports or ():
+            path = Path(name)
+            try:
+                if path.suffix != ".py":
+                    importlib.import_module(name)
+                elif (spec := importlib.util.spec_from_file_location(path.stem, path)) and spec.loader:
+                    sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
+                    spec.loader.exec_module(module)
+            except Exception as error:  # of the user's own code, which may raise anything
+                place = traceback.extract_tb(error.__traceback__)[-1]
+                placed = isinstance(error, (ImportError, SyntaxError))  # which say the place themselves
+                where = "" if placed else f" ({place.filename}, line {place.lineno})"
+                raise ValueError(f"--import {name}: {type(error).__name__}: {error}{where}") from None
+        yield cli
+
+
+def _require(condition: Any, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+def _require_folder(path: Path | None) -> None:
+    there = path is None or path.resolve().parent.is_dir()
+    _require(there, f"{path} cannot be written (no folder {path and path.parent}): name a place that can be.")
+
+
+def _reporting(command: Callable[..., None]) -> Callable[..., None]:
+    """Decorate a command to tell its errors in one line and exit with code 2."""
+
+    def tell(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    @wraps(command)
+    def guarded(*args: Any, **kwargs: Any) -> None:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("default", UserWarning)
+                warnings.showwarning = lambda message, *_: tell(f"warning: {' '.join(str(message).split())}")
+                command(*args, **kwargs)
+        except typer.Exit:  # a RuntimeError too
+            raise
+        except (ValueError, RuntimeError, OSError, MemoryError) as error:
+            tell(f"mpmjax: {' '.join(str(error).split()) or 'there is not enough memory for this'}")
+            raise typer.Exit(2) from None
+
+    return guarded
+
+
+def scene_table(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
+    """The table in a scene file, after changes "KEY=VALUE" with a dotted key and a value as TOML writes it (a string
+    may lack its quotes). A ValueError says in one line what is not one of these."""
+    try:
+        table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"Cannot read the scene file {path}: {str(error.strerror).lower()}.") from None
+    except RecursionError:
+        raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
+    except ValueError as error:  # TOML's and UTF-8's among them
+        text = " ".join(str(error)[:800].split())
+        raise ValueError(f"{path} is not a TOML file: {text if len(text) < 80 else text[:77] + '...'}.") from None
+    for name in ("particles", "run"):
+        _require(name in table, f"{path}: needs the table [{name}]. See docs/scene_files.md.")
+    for change in changes:
+        key, equals, text = change.partition("=")
+        _require(key and equals, f"--set must be KEY=VALUE, such as material.youngs_modulus=2e5, got {change!r}.")
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text
+        *owners, last = key.strip().split(".")
+        owner: Any = table
+        try:
+            for name in owners:
+                owner = owner[int(name)] if isinstance(owner, list) else owner.setdefault(name, {})
+            owner[int(last) if isinstance(owner, list) else last] = value
+        except (AttributeError, IndexError, TypeError, ValueError):
+            raise ValueError(f"--set {key}: {path} has no such place; tables of a list have numbers from 0.") from None
+    return table
+
+
+MostSeconds = Annotated[
+    float | None,
+    typer.Option(help="What pilot runs may take, compilation included. Default: the file's most_seconds, or 60."),
+]
+Imports = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--import",
+        metavar="MODULE",
+        help="A module, or its .py file, that registers classes of your own (mpm.register); its code is executed.",
+    ),
+]
+ScenePath = Annotated[Path, typer.Argument(help="A TOML scene file; docs/scene_files.md is its schema.")]
+RunPath = Annotated[Path, typer.Argument(help="An HDF5 file of a run.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change the file's key, such as grid.spacing=0.05; repeatable."),
+]
+
+
+@app.callback(invoke_without_command=True)
+def _(
+    show_version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+) -> None:
+    if show_version:
+        print(f"mpmjax {version('mpmjax')}")
+        raise typer.Exit
+
+
+@app.command()
+@_reporting
+def run(
+    scene: ScenePath,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The HDF5 file to write; ParaView opens it.")],
+    overwrite: Annotated[bool, typer.Option(help="Replace the output file if it exists.")] = False,
+    resume: Annotated[bool, typer.Option(help="Continue the output file from its last frame.")] = False,
+    dt: Annotated[str | None, typer.Option(metavar="S", help='Another step [s], "stable" or "auto".')] = None,
+    t1: Annotated[float | None, typer.Option(help="Another end time [s].")] = None,
+    steps: Annotated[int | None, typer.Option(help="End after so many steps, whatever t1.")] = None,
+    method: Annotated[str | None, typer.Option(help="Another method, such as Explicit.")] = None,
+    changes: Changes = None,
+    quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
+    most_seconds: MostSeconds = None,
+    imports: Imports = None,
+) -> None:
+    """Simulate a scene and write its frames."""
+    _require(not (overwrite and resume), "--overwrite starts a file anew and --resume continues it: give one of them.")
+    _require(steps is None or t1 is None, "--steps and --t1 both say where the run ends: give one of them.")
+    free = overwrite or resume or not output.exists()
+    _require(free, f"{output} exists: choose another name, or give --overwrite or --resume.")
+    _require_folder(output)
+    options = {"dt": dt, "t1": t1, "method": method}
+    changed = [*(changes or ()), *(f"run.{key}={value}" for key, value in options.items() if value is not None)]
+    settings = scene_table(scene, changed)["run"]
+    if steps is not None:
+        step = settings.get("dt") if isinstance(settings, dict) else None
+        known = isinstance(step, (int, float)) and steps > 0
+        _require(known, "--steps must be positive and needs a step in seconds, from the file or by --dt.")
+        changed.append(f"run.t1={steps * float(step or 0)!r}")
+    with _package(imports) as cli:
+        cli.run_scene(
+            scene, output, changed, overwrite=overwrite, resume=resume, quiet=quiet, most_seconds=most_seconds
+        )
+
+
+@app.command()
+@_reporting
+def check(
+    scene: ScenePath,
+    plot: Annotated[Path | None, typer.Option(help="A picture of the particles as they start, to write.")] = None,
+    changes: Changes = None,
+    imports: Imports = None,
+) -> None:
+    """Describe a scene: size, longest step, seconds, what looks wrong."""
+    scene_table(scene, changes or ())
+    _require_folder(plot)
+    with _package(imports) as cli:
+        cli.check_scene(scene, changes or (), plot)
+
+
+@app.command()
+@_reporting
+def fit(
+    scene: ScenePath,
+    plot: Annotated[Path | None, typer.Option(help="The picture to write. Default: SCENE_fit.png here.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="An HDF5 file that is to hold each iteration; with --refine one a grid.")
+    ] = None,
+    resume: Annotated[bool, typer.Option(help="Continue the fit of the log.")] = False,
+    refine: Annotated[
+        str | None, typer.Option(metavar="N[,N]", help="Fit on N times as many cells a direction too, and extrapolate.")
+    ] = None,
+    profiles: Annotated[
+        list[str] | None,
+        typer.Option("--profile", metavar="NAME", help="A fitted number whose profile is drawn; repeatable."),
+    ] = None,
+    most_seconds: MostSeconds = None,
+    imports: Imports = None,
+) -> None:
+    """Fit parameters to what was measured.
+
+    What to fit says the file's [fit] table. It prints a table, and writes a picture and its numbers as JSON. Ctrl-C
+    ends it after the iteration in progress, with the best so far."""
+    _require(log is not None or not resume, "--resume continues the fit of a log: name it by --log.")
+    _require("fit" in scene_table(scene), f"{scene} has no [fit] table: there is nothing to fit.")
+    plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
+    _require_folder(plot)
+    try:
+        grids = tuple(int(part) for part in refine.split(",")) if refine is not None else None
+    except ValueError:
+        raise ValueError(f"--refine must be whole numbers with commas, such as 2, got {str(refine)[:20]!r}.") from None
+    with _package(imports) as cli:
+        cli.fit_scene(scene, plot, grids, profiles or (), log=log, resume=resume, most_seconds=most_seconds)
+
+
+@app.command()
+@_reporting
+def chart(
+    scene: ScenePath,
+    error: Annotated[float, typer.Option(help="The relative error of the motion that is asked for.")] = 1e-2,
+    changes: Changes = None,
+    most_seconds: MostSeconds = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="The chart to write, its numbers beside it as .csv.")
+    ] = None,
+    imports: Imports = None,
+) -> None:
+    """Find the cheapest method and step for an error."""
+    scene_table(scene, changes or ())
+    output = Path(f"{scene.stem}_chart.png") if output is None else output
+    _require_folder(output)
+    with _package(imports) as cli:
+        cli.chart_scene(scene, output, changes or (), error=error, most_seconds=most_seconds)
+
+
+def _angles(text: str) -> tuple[float, float]:
+    try:
+        azimuth, elevation = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not AZIMUTH,ELEVATION in degrees, such as -135,30.") from None
+    return azimuth, elevation
+
+
+@app.command()
+@_reporting
+def render(
+    path: RunPath,
+    output: Annotated[Path, typer.Option("--output", "-o", help="A picture: .png, .pdf, .svg, or .gif of all frames.")],
+    colour: Annotated[
+        str, typer.Option(help="What colours the particles: speed, volume, energy, what a law remembers, none.")
+    ] = "speed",
+    frame: Annotated[int | None, typer.Option(help="The frame of a still; negative from the end.")] = None,
+    view: Annotated[
+        tuple,
+        typer.Option(
+            parser=_angles, metavar="AZIMUTH,ELEVATION", help="Of the eye, in degrees: where a run in 3-D is seen from."
+        ),
+    ] = "30,20",  # pyright: ignore[reportArgumentType]  # parsed as if it had been given
+    dpi: Annotated[float, typer.Option(help="Resolution.")] = 120.0,
+    fps: Annotated[int, typer.Option(help="Frames a second of an animation.")] = 20,
+    imports: Imports = None,
+) -> None:
+    """Draw a run's particles."""
+    _require(path.exists(), f"{path} does not exist: check its name.")
+    _require_folder(output)
+    with _package(imports):
+        import mpmjax as mpm
+
+        mpm.render(mpm.load(path), output, colour=colour, frame=frame, view=view, fps=fps, dpi=dpi)
+    print(f"written {output}")
+
+
+@app.command()
+@_reporting
+def info(
+    path: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="An HDF5 file of a run, to describe.")] = None,
+    imports: Imports = None,
+) -> None:
+    """Describe a run's file, or the installation.
+
+    Without a file it says which versions run, on which devices, and who sums between particles and nodes."""
+    _require(path is None or path.exists(), f"{path} does not exist: check its name.")
+    with _package(imports) as cli:
+        print(cli.installation() if path is None else cli.describe_run(path))
+
+
+@app.command()
+@_reporting
+def example(
+    name: Annotated[str | None, typer.Argument(help="Such as jelly. Without it they are listed.")] = None,
+) -> None:
+    """Copy an example into examples/ here, or list them."""
+    here = Path(__file__).parent
+    folder = next(path for path in (here / "mpmjax/examples", here / "examples") if path.is_dir())  # wheel, clone
+    titles = {}
+    for path in sorted((*folder.glob("*.toml"), *folder.glob("*.py"))):
+        text = re.sub(r'^(# %% \[markdown\])?[#"\s]*', "", path.read_text(encoding="utf-8"))
+        titles[path.name] = re.split(r"[.:;](?:\s|$)", text, maxsplit=1)[0].replace("\n# ", " ")
+    if name is None:
+        print("\n".join(f"{file:<22} {title}" for file, title in titles.items()))
+        return
+    names = [file for file in titles if name in (file, Path(file).stem)]
+    _require(names, f"There is no example {name!r}; there are {', '.join(titles)}.")
+    for file in names:  # grows by the files that each names
+        target, text = Path("examples", file), (folder / file).read_text(encoding="utf-8")
+        named = re.findall(r"[\w/]+\.(?:csv|toml)\b", text)
+        names += [
+            f
+            for f in dict.fromkeys(n.removeprefix("examples/") for n in named)
+            if f not in names and (folder / f).is_file()
+        ]
+        _require(
+            not target.exists() or target.read_text(encoding="utf-8") == text,
+            f"{target} exists and differs: move it away.",
+        )
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(text, encoding="utf-8")
+        print(f"written {target}")
+    commands = re.findall(r"^# +((?:mpmjax|python) .*)$", (folder / names[0]).read_text(encoding="utf-8"), re.MULTILINE)
+    print("\n".join(commands or [f"python examples/{names[0]}"]))
 
 
 if __name__ == "__main__":  # `python -m mpmjax_command`, the command without its script

@@ -2,7 +2,7 @@
 # Treloar's rubber by five laws. Each is fitted jointly to a uniaxial test, in three dimensions, and to a pure shear
 # test, in plane strain; an information criterion compares them; the best one predicts the equibiaxial test, with its
 # band.
-# `python examples/rubber_laws.py` writes docs/rubber_laws.png and docs/rubber_equibiaxial.csv, in some minutes.
+# `python examples/rubber_laws.py` writes rubber_laws.png and rubber_equibiaxial.csv, in some minutes.
 
 # %%
 import sys
@@ -154,12 +154,12 @@ def report(results, ranges):
     """The table, the prediction of the best law, the picture; and the checks of the prediction."""
     print(table(results))
     best = min(results, key=lambda name: criterion(results[name]))
-    x, docs = np.linspace(1, 4, 31), HERE.parent / "docs"
+    x = np.linspace(1, 4, 31)
     band = predicted(results[best], LAWS[best][1], lambda law: tension(law, jnp.asarray(x), "equibiaxial"))
     columns = np.stack([x, *(a / 1e6 for a in band)], axis=1)
     head = "stretch,nominal_stress_MPa,lower,upper"
-    np.savetxt(docs / "rubber_equibiaxial.csv", columns, "%.5g", ",", header=head, comments="")
-    draw(results, ranges, best, x, band, docs / "rubber_laws.png")
+    np.savetxt("rubber_equibiaxial.csv", columns, "%.5g", ",", header=head, comments="")
+    draw(results, ranges, best, x, band, Path("rubber_laws.png"))
     check = experiment(results[best].scene.material, "equibiaxial", x[5::5], band[0][5::5])
     (simulated,) = check.predictions(check.run())
     apart = np.abs(np.asarray(simulated) / band[0][5::5] - 1).max()

@@ -16,7 +16,6 @@ import mpmjax as mpm
 
 jax.config.update("jax_enable_x64", True)
 
-ROOT = Path(__file__).parents[1]
 CELLS, SCATTER = 8, 0.05  # cells to the length of the column, of the coarser grid; scatter about the laws, assumed
 REPOSE = {"sand": (29, 31), "beads": (22, 22)}  # degrees, published
 
@@ -25,7 +24,7 @@ parser.add_argument("--quick", action="store_true", help="coarser, no picture")
 quick = parser.parse_args().quick
 CELLS = 4 if quick else CELLS
 
-table = np.loadtxt(ROOT / "examples/data/column_collapse_runout.csv", delimiter=",", skiprows=3)
+table = np.loadtxt(Path(__file__).parent / "data/column_collapse_runout.csv", delimiter=",", skiprows=3)
 runouts = {"sand": table[:, :2], "beads": table[:, [0, 2]]}
 
 
@@ -82,7 +81,7 @@ if not quick:
         axis.fill_between([place - 0.3, place + 0.3], low - 0.2, high + 0.2, color="0.8")
     axis.set_xticks(range(len(found)), found)
     axis.set(ylabel="friction angle [degrees]", title=f"{CELLS}, {2 * CELLS} cells, extrapolated; grey: repose")
-    figure.savefig(ROOT / "docs/sand_fit.png", dpi=130)
+    figure.savefig("sand_fit.png", dpi=130)
 sand, beads = (refined["friction angle"] for refined in found.values())
 assert beads.value < sand.value
 assert all(fit.converged for refined in found.values() for fit in refined.fits)

@@ -9,7 +9,7 @@ for the elastic body and the fluid another integrator.
     python examples/video_families.py                  # all of them
     python examples/video_families.py --family sand    # one of them
 
-Either puts its rows into docs/video_families.csv. With --third a third grid is fitted too, of which the film's is twice
+Either puts its rows into video_families.csv. With --third a third grid is fitted too, of which the film's is twice
 as fine; these rows are only printed.
 """
 
@@ -186,7 +186,7 @@ def fitted(
 
 
 # %% The table
-TABLE = Path(__file__).parents[1] / "docs" / "video_families.csv"
+TABLE = Path("video_families.csv")
 HEAD = ["family", "parameter", "unit", "start", "true", "found", "lower", "upper", "noise", "discretisation", "seconds"]
 
 

@@ -33,6 +33,7 @@ from mpmjax.boundary import (
     StickyCollider as StickyCollider,
     SymmetryPlane as SymmetryPlane,
 )
+from mpmjax.cli import load_scene as load_scene
 from mpmjax.discretisation import (
     APIC as APIC,
     FLIP as FLIP,

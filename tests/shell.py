@@ -2,7 +2,7 @@
 
 from typer.testing import CliRunner
 
-from mpmjax.cli._commands import app
+from mpmjax_command import app
 
 
 def shell(*words: object) -> tuple[int, str, str]:

@@ -1,9 +1,12 @@
 """Each command of the shell, on good input and on bad: one clear line, exit code 2, no traceback, nothing lost."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from disk import full_beyond
@@ -11,8 +14,11 @@ from shell import refused, shell
 
 import mpmjax as mpm
 from mpmjax.cli._commands import _summary
+from mpmjax.cli._fit_file import read_fit
 from mpmjax.cli._scene_file import read_scene_file, read_simulation
 from mpmjax.fitting._columns import read_columns
+from mpmjax.viz import COLOURS
+from mpmjax_command import scene_table
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SCENE = """
@@ -59,10 +65,10 @@ def folder(tmp_path_factory) -> Path:
 @pytest.mark.thorough
 def test_summary_says_how_many_steps_were_indefinite(folder):
     """And is silent where none was."""
-    simulation, run = read_simulation(folder / "scene.toml"), mpm.load(folder / "run.h5")
+    start, run = read_simulation(folder / "scene.toml").particles, mpm.load(folder / "run.h5")
     assert "indefinite" not in (folder / "summary").read_text()
     run = eqx.tree_at(lambda r: r.statistics.indefinite, run, run.statistics.indefinite + 5)
-    assert re.search(r"\nindefinite +the system of 5 of 6 steps", _summary(simulation, run, 6, 1.0))
+    assert re.search(r"\nindefinite +the system of 5 of 6 steps", _summary(start, run, 6, 1.0))
 
 
 def test_run_writes_the_frames_and_a_summary(folder):
@@ -89,6 +95,134 @@ def test_run_reports_what_simulate_returns(folder):
     np.testing.assert_array_equal(mpm.load(folder / "run.h5").final.x, run.final.x)
 
 
+def test_who_asks_or_errs_does_not_wait_for_jax(tmp_path):
+    """Help, the version, examples, and refusals of what needs no package to be seen: in one fresh interpreter."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "bad.toml").write_text("[grid")
+    refusals = {
+        "run none.toml -o a.h5": "Cannot read the scene file none.toml",
+        "run bad.toml -o a.h5": "is not a TOML file",
+        "run scene.toml -o scene.toml": "scene.toml exists",
+        "run scene.toml -o no/a.h5": "no folder no",
+        "run scene.toml -o a.h5 --set grid": "--set must be KEY=VALUE",
+        "run scene.toml -o a.h5 --set particles.density.x=1": "has no such place",
+        "run scene.toml -o a.h5 --steps 0": "--steps must be positive",
+        "run scene.toml -o a.h5 --steps 2 --t1 1": "give one of them",
+        "run scene.toml -o a.h5 --import none.py": "there is no file none.py",
+        "check none.toml": "Cannot read the scene file none.toml",
+        "fit scene.toml": "has no [fit] table",
+        "fit scene.toml --resume": "name it by --log",
+        "render none.h5 -o a.png": "none.h5 does not exist",
+        "info none.h5": "none.h5 does not exist",
+        "example none": "There is no example 'none'",
+        "run --help": "",
+        "--help": "",
+        "--version": "",
+        "example": "",
+    }
+    script = f"""
+import sys
+from mpmjax_command import app
+for words in {list(refusals)}:
+    try:
+        app(words.split())
+    except SystemExit as error:
+        print(words, "->", error.code)
+print(sorted({{"jax", "numpy", "h5py", "mpmjax"}} & set(sys.modules)))
+"""
+    ran = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines()[-1] == "[]"
+    for words, says in refusals.items():
+        assert f"{words} -> {2 if says else 0}" in ran.stdout, words
+        assert says in ran.stderr
+    assert ran.stderr.count("mpmjax: ") == sum(map(bool, refusals.values()))
+    assert f"mpmjax {mpm.__version__}" in ran.stdout
+
+
+def test_help_names_the_colours():
+    assert not {name for name in COLOURS if name not in shell("render", "--help")[1]}
+
+
+def test_a_change_is_made_at_its_place(folder):
+    changes = ("material.youngs_modulus=2e5", "boundary.0.lower=[0.0, 0.0]", "run.method=Explicit", "volume.kind=a b")
+    table = scene_table(folder / "scene.toml", changes)
+    assert table["material"]["youngs_modulus"] == 2e5
+    assert table["boundary"][0] == {"kind": "SlipBox", "lower": [0.0, 0.0], "upper": [0.6, np.inf]}
+    assert table["run"]["method"] == "Explicit"
+    assert table["volume"] == {"kind": "a b"}
+    assert "unknown" in refused("check", folder / "scene.toml", "--set", "grid.spacng=1")
+
+
+def test_options_of_run_stand_for_keys_of_the_file(folder, tmp_path):
+    options = ("--dt", 2e-3, "--steps", 4, "--method", "BackwardEuler", "--set", "material.youngs_modulus=2e5")
+    code, _, err = shell("run", folder / "scene.toml", "-o", tmp_path / "run.h5", "--quiet", *options)
+    assert code == 0, err
+    run = mpm.load(tmp_path / "run.h5")
+    assert (float(run.dt), int(run.final_step), type(run.method)) == (2e-3, 4, mpm.BackwardEuler)
+    assert float(run.scene.material.youngs_modulus) == 2e5
+
+
+def test_check_says_what_a_scene_takes_and_what_looks_wrong(folder, tmp_path):
+    scene, picture = folder / "scene.toml", tmp_path / "setup.png"
+    code, out, err = shell("check", scene, "--plot", picture)
+    assert code == 0, err
+    assert picture.stat().st_size > 1000
+    file = read_scene_file(scene)
+    bound = float(mpm.stable_dt(file.scene, file.particles))
+    for line in (
+        rf"particles +{file.particles.count} of float64, 4 a cell, 90 kg",
+        r"grid +10 x 14 = 140 nodes, 0\.1 m apart",
+        rf"longest step +Explicit\(\) {bound:.3g} s\n",
+        rf"steps +6 of 0\.01 s with SemiImplicit\(beta=1\), {0.01 / bound:.3g} of Explicit's longest",
+        r"a step takes +\S+ s once compiled",
+        r"memory +\S+ kB in a step",
+    ):
+        assert re.search(line, out), (line, out)
+    assert "warning" not in err
+    still = ("--set", "gravity=[0.0, 0.0]", "--set", "run.method=Explicit", "--set", "run.dt=0.06")
+    code, _, err = shell("check", scene, *still)
+    assert code == 0, err
+    assert re.search(rf"the step is {0.06 / bound:.3g} times the longest stable one", err)
+    assert "nothing moves in the first step" in err
+    assert "cells in a step" in shell("check", scene, "--set", "particles.0.velocity=[0.0, 30.0]")[2]
+
+
+def test_info_describes_a_file(folder):
+    code, out, err = shell("info", folder / "run.h5")
+    assert code == 0, err
+    assert re.search(
+        r"frames +4, from t = 0 s to 0\.06 s\nmaterials +FixedCorotated\nparticles +36\nsteps +6 of 0\.01 s", out
+    )
+    assert "total energy" in out
+    assert "jaxlib" in shell("info")[1]
+
+
+def test_an_example_is_copied_with_its_data(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert shell("example")[1].count("\n") == len([*EXAMPLES.glob("*.toml"), *EXAMPLES.glob("*.py")])
+    for _ in range(2):  # a copy that is there already is no fault
+        code, out, err = shell("example", "rubber")
+        assert code == 0, err
+    assert out.splitlines()[-2:] == ["mpmjax fit examples/rubber.toml", "mpmjax run examples/rubber.toml -o rubber.h5"]
+    assert read_fit(tmp_path / "examples/rubber.toml").experiments
+    with open("examples/rubber.toml", "a") as file:
+        file.write("# mine")
+    assert "examples/rubber.toml exists and differs" in refused("example", "rubber.toml")
+
+
+def test_a_scene_is_loaded_as_the_shell_runs_it(folder):
+    """The arguments of `simulate`; in JAX's own precision if the file names none."""
+    scene, particles, settings = mpm.load_scene(folder / "scene.toml")
+    run = mpm.simulate(scene, particles, **settings)
+    recorded = mpm.load(folder / "run.h5")
+    np.testing.assert_array_equal(run.frames.x, recorded.frames.x)
+    with jax.enable_x64(False):
+        assert mpm.load_scene(folder / "scene.toml")[1].x.dtype == np.float32
+        (folder / "double.toml").write_text(SCENE.replace("t1 =", 'precision = "float64"\nt1 ='))
+        with pytest.raises(ValueError, match="jax_enable_x64"):
+            mpm.load_scene(folder / "double.toml")
+
+
 def test_run_does_not_replace_a_file_unasked_and_resumes_it(folder):
     before = (folder / "run.h5").read_bytes()
     assert "exists" in refused("run", folder / "scene.toml", "-o", folder / "run.h5")
@@ -107,7 +241,7 @@ def test_a_complete_run_is_resumed_with_success(folder, tmp_path):
     before = (folder / "run.h5").read_bytes()
     code, out, err = shell("run", folder / "scene.toml", "-o", folder / "run.h5", "--resume", "--quiet")
     assert code == 0, err
-    assert out.splitlines()[-1].endswith("run.h5 complete already: it reaches t = 0.06 s")
+    assert re.search(r"run\.h5 \(\S+ kB\) complete already: it reaches t = 0\.06 s\n$", out)
     assert (folder / "run.h5").read_bytes() == before
 
 

@@ -58,7 +58,7 @@ def imported(path: Path) -> set[str]:
 def test_the_rooms_are_the_folders():
     """Every folder is one of `ROOMS`, and every room a folder."""
     assert {name.split("/")[0] for name in INSIDE} == set(ROOMS)
-    assert set(FILES) - set(INSIDE) == {"__init__.py", "_jax.py", "_types.py"}
+    assert set(FILES) - set(INSIDE) == {"__init__.py", "__main__.py", "_jax.py", "_types.py"}
 
 
 @pytest.mark.parametrize("name", INSIDE)

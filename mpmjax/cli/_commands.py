@@ -1,24 +1,19 @@
-"""The shell's commands: `mpmjax run`, `mpmjax fit`, `mpmjax chart`, `mpmjax render`, `mpmjax info`."""
+"""What the shell's commands do, which `mpmjax_command` reads: run, check, fit, chart, and say what a file holds."""
 
-import importlib
-import importlib.util
 import signal
 import sys
 import time
-import traceback
-import warnings
-from collections.abc import Callable
-from functools import wraps
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-import typer
 
-from mpmjax.analysis import Trial, energy, grid_mass, name_of, pieces, work_precision
-from mpmjax.checks import require, shortened
+from mpmjax.analysis import METHODS, Trial, energy, grid_mass, name_of, pieces, work_precision
+from mpmjax.checks import require, warn
 from mpmjax.cli._fit_file import FitFile, read_fit, refinements
 from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
 from mpmjax.fitting import (
@@ -32,117 +27,50 @@ from mpmjax.fitting import (
     predict_observations,
     profile,
 )
-from mpmjax.io import check_place, end_on_signals, load, record, reporting, steps_in, stopping
+from mpmjax.io import check_place, load, record, reporting, steps_in, stopping
 from mpmjax.native import backend
-from mpmjax.simulation import Run
-from mpmjax.viz import COLOURS, draw_chart, draw_fit, render, write_fit, write_trials
-
-app = typer.Typer(
-    help="A differentiable Material Point Method.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
-)
+from mpmjax.simulation import Run, initial_state, no_steps, run_to
+from mpmjax.state import Particles
+from mpmjax.stepping import Explicit, stable_dt, step
+from mpmjax.viz import draw_chart, draw_fit, render, write_fit, write_trials
 
 
-def _reporting(command: Callable[..., None]) -> Callable[..., None]:
-    """Decorate a command to tell its errors in one line and exit with code 2."""
-
-    @wraps(command)
-    def guarded(*args: Any, **kwargs: Any) -> None:
-        try:
-            with jax.enable_x64(True), warnings.catch_warnings():
-                warnings.simplefilter("default", UserWarning)
-                warnings.showwarning = lambda message, *_: _print_error(f"warning: {' '.join(str(message).split())}")
-                command(*args, **kwargs)
-        except typer.Exit:  # a RuntimeError too
-            raise
-        except (ValueError, RuntimeError, OSError, MemoryError) as error:
-            told = " ".join(str(error).split()) or "there is not enough memory for this"
-            print(f"mpmjax: {told}", file=sys.stderr)
-            raise typer.Exit(2) from None
-
-    return guarded
-
-
-MostSeconds = Annotated[
-    float | None,
-    typer.Option(help="What pilot runs may take, compilation included. Default: the file's most_seconds, or 60."),
-]
-
-
-def _import(modules: list[str] | None) -> None:
-    """Import modules, each by its name or by the path of its .py file: files know what they register from then on."""
-    for name in modules or []:
-        path = Path(name)
-        if path.suffix == ".py":
-            require(path.is_file(), f"--import: there is no file {name}.")
-        else:
-            spec = importlib.util.find_spec(name.partition(".")[0])
-            require(spec, f"--import: Python finds no module {name!r}; name its .py file instead.")
-        try:
-            if path.suffix != ".py":
-                importlib.import_module(name)
-            elif (spec := importlib.util.spec_from_file_location(path.stem, path)) and spec.loader:
-                sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
-                spec.loader.exec_module(module)
-        except Exception as error:  # of the user's own code, which may raise anything
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            placed = isinstance(error, (ImportError, SyntaxError))  # which say the place themselves
-            where = "" if placed else f" ({place.filename}, line {place.lineno})"
-            raise ValueError(f"--import {name}: {type(error).__name__}: {error}{where}") from None
-
-
-Imports = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--import",
-        metavar="MODULE",
-        help="A module, or its .py file, that registers classes of your own (mpm.register); its code is executed.",
-    ),
-]
-ScenePath = Annotated[Path, typer.Argument(help="A TOML scene file; docs/scene_files.md is its schema.")]
-
-
-@app.command("run")
-@_reporting
-def run_command(
-    scene: ScenePath,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The HDF5 file to write; ParaView opens it.")],
-    overwrite: Annotated[bool, typer.Option(help="Replace the output file if it exists.")] = False,
-    resume: Annotated[bool, typer.Option(help="Continue the output file from its last frame.")] = False,
-    quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
-    most_seconds: MostSeconds = None,
-    imports: Imports = None,
+def run_scene(
+    path: Path,
+    output: Path,
+    changes: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    quiet: bool = False,
+    most_seconds: float | None = None,
 ) -> None:
-    """Simulate a scene and write its frames."""
-    _import(imports)
-    require(not (overwrite and resume), "--overwrite starts a file anew and --resume continues it: give one of them.")
+    """Simulate a scene file after changes to it, and write the run's frames."""
     done = steps_in(output) if resume else 0
     if not resume:
         check_place(output, overwrite=overwrite)
-    simulation = _chosen(scene, most_seconds, quiet=quiet)
+    simulation = _chosen(path, most_seconds, changes, quiet=quiet)
     begun = time.perf_counter()
     run = record(
         output,
         simulation.scene,
         simulation.particles,
-        t1=simulation.t1,
-        dt=simulation.dt,
-        method=simulation.method,
-        save_every=simulation.save_every,
+        **simulation.settings,
         overwrite=overwrite,
         resume=resume,
         progress=not quiet,
     )
     taken, seconds = int(run.statistics.steps) - done, time.perf_counter() - begun
     with reporting(lambda: f"{output} is complete."):
-        print(_summary(simulation, run, taken, seconds))
+        print(_summary(simulation.particles, run, taken, seconds))
     reached = f"complete already: it reaches t = {float(run.final_step * run.dt):.6g} s" if resume and not taken else ""
-    print(f"written            {output} {reached}".rstrip())
+    print(f"written            {output} ({_bytes(output.stat().st_size)}) {reached}".rstrip())
 
 
-def _chosen(scene: Path, most_seconds: float | None, *, quiet: bool = False) -> Simulation:
+def _chosen(scene: Path, most_seconds: float | None, changes: Sequence[str] = (), *, quiet: bool = False) -> Simulation:
     """The simulation of a scene file; pilot runs are reported on standard error, their choice on standard output."""
     told = {} if quiet else {"progress": lambda trial: _print_error(_line(trial)), "say": _print_error}
-    simulation = read_simulation(scene, most_seconds=most_seconds, **told)
+    simulation = read_simulation(scene, changes, most_seconds=most_seconds, **told)
     if simulation.choice is not None:
         print(f"{'chosen':<18} {simulation.choice}")
     return simulation
@@ -152,22 +80,29 @@ def _print_error(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> str:
-    """The cost of a run, with `taken` of its steps done in these seconds, and how well it kept mass and energy."""
+def _bytes(size: int | float) -> str:
+    return next(
+        f"{size / k:.3g} {unit}" for k, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")) if size >= k or k == 1e3
+    )
+
+
+def _summary(start: Particles, run: Run, taken: int = 0, seconds: float = 0.0) -> str:
+    """The cost of a run from its first particles on, if `taken` of its steps were done in these seconds, and how well
+    it kept mass and energy."""
     s, p, steps = run.statistics, run.final.count, max(int(run.statistics.steps), 1)
-    before, after = energy(run.scene, simulation.particles), energy(run.scene, run.final)
-    whole, parts = pieces(run.scene, simulation.particles), pieces(run.scene, run.final)
+    before, after = energy(run.scene, start), energy(run.scene, run.final)
+    whole, parts = pieces(run.scene, start), pieces(run.scene, run.final)
     mass, linearisation = float(run.final.mass.sum()), float(s.linearisation_error)
     lost = (float(grid_mass(run.scene, run.final)) - mass) / mass
     lines = [
         (True, "particles", f"{p}"),
         (True, "steps", f"{int(s.steps)} of {float(run.dt):.4g} s with {type(run.method).__name__}"),
         (
-            True,
+            taken > 0,
             "wall time",
-            f"{seconds:.3g} s, {taken * p / seconds:.3g} particle-steps per second, both with compilation",
+            f"{seconds:.3g} s, {taken * p / (seconds or 1):.3g} particle-steps per second, both with compilation",
         ),
-        (True, "sums", f"{backend()}"),
+        (taken > 0, "sums", f"{backend()}"),
         (
             int(s.iterations) > 0,
             "solver",
@@ -197,45 +132,24 @@ def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> st
     return "\n".join(f"{name:<18} {text}" for shown, name, text in lines if shown)
 
 
-@app.command("fit")
-@_reporting
-def fit_command(
-    scene: ScenePath,
-    plot: Annotated[Path | None, typer.Option(help="The picture to write. Default: SCENE_fit.png here.")] = None,
-    log: Annotated[
-        Path | None, typer.Option(help="An HDF5 file that is to hold each iteration; with --refine one a grid.")
-    ] = None,
-    resume: Annotated[bool, typer.Option(help="Continue the fit of the log.")] = False,
-    refine: Annotated[
-        str | None, typer.Option(metavar="N[,N]", help="Fit on N times as many cells a direction too, and extrapolate.")
-    ] = None,
-    profiles: Annotated[
-        list[str] | None,
-        typer.Option("--profile", metavar="NAME", help="A fitted number whose profile is drawn; repeatable."),
-    ] = None,
-    most_seconds: MostSeconds = None,
-    imports: Imports = None,
+def fit_scene(
+    scene: Path,
+    plot: Path,
+    grids: tuple[int, ...] | None,
+    profiles: Sequence[str],
+    *,
+    log: Path | None,
+    resume: bool,
+    most_seconds: float | None,
 ) -> None:
-    """Fit parameters to what was measured, as the file's [fit] table says: a table, a picture, and its numbers as
-    JSON. Ctrl-C ends it after the iteration in progress, with the best so far."""
-    _import(imports)
+    """Fit what a scene file's [fit] table names: on its grids, or those asked for, with profiles of some of it."""
     begun = time.perf_counter()
-    require(log is not None or not resume, "--resume continues the fit of a log: name it by --log.")
     asked = read_fit(scene, lambda file: _chosen(file, most_seconds))
-    grids = asked.refine
-    if refine is not None:
-        try:
-            numbers = tuple(int(part) for part in refine.split(","))
-        except ValueError:
-            text = shortened(refine, 20)
-            raise ValueError(f"--refine must be whole numbers with commas, such as 2, got {text!r}.") from None
-        grids = refinements(numbers, "--refine")
+    grids = asked.refine if grids is None else refinements(grids, "--refine")
     if grids:
         asked.refined(grids[-1])  # a grid that cannot be is refused before the first fit
-    plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
-    require(plot.resolve().parent.is_dir(), f"{plot} cannot be written (no folder {plot.parent}).")
     labels = FitProblem(asked.experiments, asked.parameters).labels
-    unknown = [name for name in profiles or () if name not in labels]
+    unknown = [name for name in profiles if name not in labels]
     require(not unknown, f"--profile names {unknown[:1]}, but what is fitted is {', '.join(labels)}.")
     common: dict[str, Any] = {"report": asked.report, "level": asked.level, "optimiser": asked.optimiser}
     common |= {"log": log, "resume": resume}
@@ -259,7 +173,7 @@ def fit_command(
         print(outcome)
         result, iterations = fits[-1], sum(len(each.history) for each in fits)
         drawn: list[Profile] = []  # after a signal those that are done
-        wanted = [] if result.interrupted else profiles or []
+        wanted = [] if result.interrupted else profiles
         try:
             for name in wanted:
                 drawn.append(profile(result, name, progress=progress))
@@ -272,7 +186,7 @@ def fit_command(
     numbers = write_fit(outcome, plot.with_suffix(".json"), *report)
     print(f"written {draw_fit(result, plot, *report)} and {numbers}")
     if stop.signal or result.interrupted:
-        raise typer.Exit(128 + (stop.signal or signal.SIGINT))
+        sys.exit(128 + (stop.signal or signal.SIGINT))
 
 
 def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> FitFile:
@@ -301,21 +215,9 @@ def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> Fit
     return asked._replace(parameters=parameters, experiments=until(asked.experiments), refined=refined)
 
 
-@app.command("chart")
-@_reporting
-def chart_command(
-    scene: ScenePath,
-    error: Annotated[float, typer.Option(help="The relative error of the motion that is asked for.")] = 1e-2,
-    most_seconds: MostSeconds = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="The chart to write, its numbers beside it as .csv.")
-    ] = None,
-    imports: Imports = None,
-) -> None:
-    """Chart a scene's error against seconds, and name the cheapest setting for an error."""
-    _import(imports)
-    file = read_scene_file(scene)
-    output = Path(f"{scene.stem}_chart.png") if output is None else output
+def chart_scene(scene: Path, output: Path, changes: Sequence[str], *, error: float, most_seconds: float | None) -> None:
+    """Chart a scene file's error against seconds, and name the cheapest setting for an error."""
+    file = read_scene_file(scene, changes)
     print(
         f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9} {'linearisation':>13}",
         flush=True,
@@ -344,49 +246,71 @@ def _line(trial: Trial) -> str:
     )
 
 
-def _angles(text: str) -> tuple[float, float]:
-    try:
-        azimuth, elevation = (float(part) for part in text.split(","))
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is not AZIMUTH,ELEVATION in degrees, such as -135,30.") from None
-    return azimuth, elevation
+def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
+    """Say what a scene file holds, how long its steps may be, and what a step of it takes, by trying one."""
+    file = read_scene_file(path, changes)
+    scene, particles, run = file.scene, file.particles, file.run
+    x, dx = np.asarray(particles.x), float(scene.grid.spacing)
+
+    def say(name: str, text: str) -> None:
+        print(f"{name:<18} {text}", flush=True)
+
+    say("materials", ", ".join(law.title() for law in scene.laws))
+    each = float(particles.volume.mean()) / dx**particles.dim
+    say("particles", f"{particles.count} of {particles.x.dtype}, {1 / each:.3g} a cell, {particles.mass.sum():.6g} kg")
+    say("from, to", f"{x.min(axis=0)} m, {x.max(axis=0)} m")
+    say("grid", f"{' x '.join(map(str, scene.grid.shape))} = {scene.grid.size} nodes, {dx:.4g} m apart")
+    bounds = {name_of(method): float(stable_dt(scene, particles, method=method)) for method in METHODS}
+    say("longest step", ", ".join(f"{name} {dt:.3g} s" for name, dt in bounds.items() if np.isfinite(dt)))
+    say("without bound", ", ".join(name for name, dt in bounds.items() if np.isinf(dt)))
+    method, dt = run.method, stable_step(path, file) if run.dt == "stable" else run.dt
+    state = initial_state(scene, particles)
+    if method is not None and dt is not None:
+        dt = float(dt)
+        of_explicit, bound = dt / bounds[name_of(Explicit())], float(stable_dt(scene, particles, method=method))
+        say("steps", f"{run.t1 / dt:.0f} of {dt:.4g} s with {name_of(method)}, {of_explicit:.3g} of Explicit's longest")
+        begun = time.perf_counter()
+        stepped = jax.jit(lambda q, t: step(scene, q, t, dt, method=method)[0]).lower(particles, 0.0).compile()
+        after, begun, compiled = stepped(particles, 0.0), time.perf_counter(), time.perf_counter() - begun
+        jax.block_until_ready(stepped(after, dt))
+        seconds = time.perf_counter() - begun
+        say("a step takes", f"{seconds:.2g} s once compiled ({compiled:.2g} s): {seconds * run.t1 / dt:.2g} s in all")
+        used = stepped.memory_analysis()
+        if used is not None:
+            say("memory", f"{_bytes(used.temp_size_in_bytes + used.argument_size_in_bytes)} in a step")
+        numbers = 16 + 9 * (particles.C is not None)  # of x, v, J, F and C in a frame
+        frames = run.t1 / dt / (run.save_every or 1) + 1
+        say("file", f"about {_bytes(frames * particles.count * numbers * particles.x.dtype.itemsize)}")
+        if dt > bound:
+            warn(f"the step is {dt / bound:.3g} times the longest stable one: the run is likely to blow up.")
+        if not np.asarray(after.v).any():
+            warn("nothing moves in the first step: there is no gravity, load, velocity or motion yet.")
+        if (far := dt * float(np.abs(np.asarray(after.v)).max()) / dx) > 1:
+            warn(f"particles cross {far:.3g} cells in a step: take a shorter one.")
+    else:
+        say("steps", f"are chosen by pilot runs: mpmjax chart {path} shows them")
+    if plot is not None:
+        frames = jax.tree.map(lambda a: a[None], state.particles)
+        zero = jnp.zeros(1, particles.x.dtype)
+        statistics = no_steps(particles.x.dtype)
+        shown = run_to(state, 0, statistics, scene, particles, zero[0], Explicit(), steps=zero, frames=frames)
+        render(shown, plot, colour=None)
+        say("written", str(plot))
 
 
-@app.command("render")
-@_reporting
-def render_command(
-    run: Annotated[Path, typer.Argument(help="An HDF5 file of a run.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="A picture: .png, .pdf, .svg, or .gif of all frames.")],
-    colour: Annotated[
-        str, typer.Option(help=f"What colours the particles: {', '.join(COLOURS)}, what a law remembers, none.")
-    ] = "speed",
-    frame: Annotated[int | None, typer.Option(help="The frame of a still; negative from the end.")] = None,
-    view: Annotated[
-        tuple,
-        typer.Option(
-            parser=_angles, metavar="AZIMUTH,ELEVATION", help="Of the eye, in degrees: where a run in 3-D is seen from."
-        ),
-    ] = "30,20",  # pyright: ignore[reportArgumentType]  # parsed as if it had been given
-    dpi: Annotated[float, typer.Option(help="Resolution.")] = 120.0,
-    fps: Annotated[int, typer.Option(help="Frames a second of an animation.")] = 20,
-    imports: Imports = None,
-) -> None:
-    """Draw a run's particles."""
-    _import(imports)
-    render(load(run), output, colour=colour, frame=frame, view=view, fps=fps, dpi=dpi)
-    print(f"written {output}")
+def describe_run(path: Path) -> str:
+    """What a run's file holds."""
+    run = load(path)
+    lines = {
+        "file": f"{path}, {_bytes(path.stat().st_size)}, {run.final.x.dtype}",
+        "frames": f"{len(run)}, from t = {float(run.times[0]):.6g} s to {float(run.times[-1]):.6g} s",
+        "materials": ", ".join(law.title() for law in run.scene.laws),
+    }
+    return "\n".join([*(f"{name:<18} {text}" for name, text in lines.items()), _summary(run.frame(0), run)])
 
 
-@app.command("info")
-@_reporting
-def info_command() -> None:
-    """Say which versions run, on which devices, and who sums between particles and nodes."""
+def installation() -> str:
+    """The versions that run, the devices, and who sums between particles and nodes."""
     lines = [(name, version(name)) for name in ("mpmjax", "jax", "jaxlib")]
     lines += [("devices", ", ".join(map(str, jax.devices()))), ("sums", f"{backend()}")]
-    print("\n".join(f"{name:<10} {text}" for name, text in lines))
-
-
-def main() -> None:
-    """Entry point of the `mpmjax` command."""
-    end_on_signals()
-    app()
+    return "\n".join(f"{name:<10} {text}" for name, text in lines)

@@ -2,11 +2,11 @@
 words."""
 
 import itertools
-import tomllib
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
 from mpmjax.checks import require, require_positive, shortened, warn
 from mpmjax.geometry import AbstractRegion
-from mpmjax.io import arguments, decode, reason
+from mpmjax.io import arguments, decode
 from mpmjax.simulation import number_of_steps
 from mpmjax.state import Particles, Scene, attach, fill, join, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
@@ -28,10 +28,10 @@ class RunSettings(eqx.Module):
     """The `[run]` table of a scene file."""
 
     t1: float = eqx.field(converter=float)  # end time [s]
-    dt: Scalar | Literal["stable"] | None = None  # step [s]; None for "auto"
+    dt: Scalar | str | None = None  # step [s], or "stable"; None for "auto"
     method: AbstractIntegrator | None = None  # None for "auto"
     save_every: int | None = None  # steps from frame to frame; None if the file does not say
-    precision: str = "float64"
+    precision: str | None = None  # None for JAX's own, in the shell float64
     error: float = eqx.field(converter=float, default=1e-2)  # relative error that "auto" aims at
     most_seconds: float = eqx.field(converter=float, default=60.0)  # seconds that its pilot runs may take
 
@@ -44,9 +44,11 @@ class RunSettings(eqx.Module):
         require_positive("[run] error", self.error)
         require_positive("[run] most_seconds", self.most_seconds)
         every = self.save_every is None or self.save_every >= 1
-        require(every, f"[run] save_every must be at least 1, got {self.save_every}.")
-        is_dtype = self.precision in ("float32", "float64")
+        is_dtype = self.precision in ("float32", "float64", None)
         require(is_dtype, f'[run] precision must be "float32" or "float64", got {self.precision!r}.')
+        double = jnp.result_type(float) == jnp.float64 or self.precision != "float64"
+        require(double, '[run] precision = "float64" needs jax.config.update("jax_enable_x64", True) first.')
+        require(every, f"[run] save_every must be at least 1, got {self.save_every}.")
 
 
 class SceneFile(NamedTuple):
@@ -72,19 +74,36 @@ class Simulation(NamedTuple):
     choice: str | None  # the choice for "auto" or "stable", and why; None if there was none
     build: Build  # makes the scene and its particles on n times as many cells a direction, from n
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What `simulate` and `record` take beside scene and particles."""
+        return {"t1": self.t1, "dt": self.dt, "method": self.method, "save_every": self.save_every}
 
-def read_scene_file(path: Path) -> SceneFile:
-    """Read a scene file; a ValueError says in one line which key is unknown, missing or unfit, and where."""
-    try:
-        table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"Cannot read the scene file {path}: {reason(error).lower()}.") from None
-    except RecursionError:
-        raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
-    except ValueError as error:  # TOML's and UTF-8's among them
-        raise ValueError(f"{path} is not a TOML file: {shortened(str(error))}.") from None
-    for name in ("particles", "run"):
-        require(name in table, f"{path}: needs the table [{name}]. See docs/scene_files.md.")
+
+def load_scene(path: str | os.PathLike) -> tuple[Scene, Particles, dict[str, Any]]:
+    """The scene of a TOML file (docs/scene_files.md), its particles, and its `[run]` as arguments of `simulate` and
+    `record`:
+
+        scene, particles, settings = mpm.load_scene("examples/jelly.toml")
+        run = mpm.simulate(scene, particles, **settings)
+
+    Numbers are of the file's precision; if it names none, of JAX's, float32 unless 64-bit mode is on. The shell turns
+    that on. "stable" and "auto" are resolved as there, the latter by pilot runs.
+
+    Raises:
+        ValueError: a file that is missing or not TOML; a key that is unknown, missing or unfit: one line with its
+            place.
+    """
+    simulation = read_simulation(Path(path))
+    return simulation.scene, simulation.particles, simulation.settings
+
+
+def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
+    """Read a scene file after changes to it (see `scene_table`); a ValueError says in one line which key is unknown,
+    missing or unfit, and where."""
+    from mpmjax_command import scene_table  # here, since it imports the shell's parser
+
+    table = scene_table(path, changes)
     fit_table = table.pop("fit", None)
     require(fit_table is None or isinstance(fit_table, dict), f"{path}: [fit] must be a table.")
     groups, run_table = table.pop("particles"), table.pop("run")
@@ -117,14 +136,15 @@ def read_scene_file(path: Path) -> SceneFile:
 
 def read_simulation(
     path: Path,
+    changes: Sequence[str] = (),
     *,
     most_seconds: float | None = None,
     progress: Callable[[Trial], None] = lambda trial: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Simulation:
-    """Read a scene file, and resolve its "stable" step or what it leaves to pilot runs by "auto", within
-    `most_seconds` or what the file says. `progress` and `say` are those of `work_precision`."""
-    file = read_scene_file(path)
+    """Read a scene file (see `read_scene_file`), and resolve its "stable" step or what it leaves to pilot runs by
+    "auto", within `most_seconds` or what the file says. `progress` and `say` are those of `work_precision`."""
+    file = read_scene_file(path, changes)
     run, choice = file.run, None
     t1, dt, method, save_every = run.t1, run.dt, run.method, run.save_every
     require(
@@ -184,7 +204,7 @@ def _lists(material: Any) -> list[str]:
     return [key for key, value in items if isinstance(value, list)] + [k for _, v in items for k in _lists(v)]
 
 
-def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
+def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
     """The particles of all tables, those of each material together, in the materials' order."""
     filled: list[list[Particles]] = [[] for _ in scene.laws]
     regions: list[AbstractRegion] = []
