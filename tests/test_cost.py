@@ -11,18 +11,17 @@ import pytest
 from helpers import DESCRIPTIONS, KERNELS, METHODS, SECOND_ORDER, block, ids, thorough
 
 import mpmjax as mpm
-from mpmjax.autodiff._rule import _values
+from mpmjax.autodiff._custom_derivative import _Call, _values
 from mpmjax.boundary._contact import ConstrainedNodes
 from mpmjax.checks._values import canonical
 from mpmjax.implicit import Projection
-from mpmjax.implicit._solver import _solve
 from mpmjax.simulation._diffrax import Problem, SegmentAdjoint
 from mpmjax.state import state_of
 from mpmjax.stepping._nodes import Nodes
 from mpmjax.stepping._step import step_unchecked
 
 LAW = mpm.NeoHookean(1e5, 0.3)
-SUMS = ("stencil_scatter", "stencil_average", "stencil_gather", "stencil_resist")
+SUMS = ("custom_scatter", "custom_average", "custom_gather", "custom_resist")
 COUNTED = (*SUMS, "while", "floor", "exp", "log", "rem")
 
 
@@ -48,9 +47,7 @@ def operations(jaxpr, times=1):
     """How often each counted primitive or sum runs: loops of known length all their turns, others one."""
     total = Counter()
     for equation in jaxpr.eqns:
-        name = equation.primitive.name
-        if name == "native":
-            name = f"stencil_{equation.params['function']}"
+        name = name_of(equation)
         if name in COUNTED:
             total[name] += times
         turns = times * equation.params["length"] if equation.primitive.name == "scan" else times
@@ -59,14 +56,18 @@ def operations(jaxpr, times=1):
     return total
 
 
+def name_of(equation):
+    """The name of an equation's primitive, or of its function with a derivative rule or a kernel."""
+    call = equation.params.get("call")
+    return f"custom_{call.function}" if isinstance(call, _Call) else equation.primitive.name
+
+
 def inner_programs(equation):
-    """The programs in an equation's parameters, of a function with a derivative rule, or of a solve."""
-    if equation.primitive.name == "ruled":
-        yield jax.make_jaxpr(partial(_values, **equation.params))(*(a.aval for a in equation.invars)).jaxpr
-        return
-    if equation.primitive.name == "native" and str(equation.params["function"]) == "solve":
-        of = partial(_solve, **dict(equation.params["params"]))
-        yield jax.make_jaxpr(of)(*(a.aval for a in equation.invars)).jaxpr
+    """The programs in an equation's parameters, of a function with a derivative rule, or of a solve; not of kernels."""
+    call = equation.params.get("call")
+    if isinstance(call, _Call):
+        if call.function.kernel in (None, "solve"):
+            yield jax.make_jaxpr(partial(_values, call=call))(*(a.aval for a in equation.invars)).jaxpr
         return
     for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda a: hasattr(a, "eqns")):
         inner = getattr(inner, "jaxpr", inner)
@@ -102,8 +103,8 @@ def compiled(method=mpm.Explicit(), **scene):
 
 def crossings(found):
     """Sums to the nodes, and from them; an average is one of the first, a resistance one of each."""
-    to_nodes = found["stencil_scatter"] + found["stencil_average"] + found["stencil_resist"]
-    return to_nodes, found["stencil_gather"] + found["stencil_resist"]
+    to_nodes = found["custom_scatter"] + found["custom_average"] + found["custom_resist"]
+    return to_nodes, found["custom_gather"] + found["custom_resist"]
 
 
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
@@ -138,7 +139,7 @@ def test_an_iteration_of_an_implicit_step_crosses_once_each_way():
     """Whatever stencil, rotations and factors it needs is made before the loop."""
     step, arrays = program(mpm.SemiImplicit())
     (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
-    assert operations(body) == {"stencil_resist": 1}
+    assert operations(body) == {"custom_resist": 1}
 
 
 def test_the_diagonal_preconditioner_adds_one_crossing_to_a_solve_and_nothing_to_an_iteration():
@@ -147,7 +148,7 @@ def test_the_diagonal_preconditioner_adds_one_crossing_to_a_solve_and_nothing_to
     assert (more, as_many) == (there + 1, back)
     step, arrays = program(by_diagonal)
     (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
-    assert operations(body) == {"stencil_resist": 1}
+    assert operations(body) == {"custom_resist": 1}
 
 
 @pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
@@ -159,7 +160,7 @@ def test_averaged_volumes_cross_by_hats_and_what_does_not_ask_for_them_does_not(
     assert crossings(counted(**choices, volume=mpm.AveragedVolume())) == (1 + 3, 1 + 2)
     step, arrays = program(mpm.SemiImplicit(), **choices, volume=mpm.AveragedVolume())
     (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
-    assert operations(body) == {"stencil_scatter": 1 + 2, "stencil_gather": 1 + 2}
+    assert operations(body) == {"custom_scatter": 1 + 2, "custom_gather": 1 + 2}
 
 
 HELD = {
@@ -235,13 +236,13 @@ def test_a_collider_scatters_nothing_and_adds_no_crossing_to_an_iteration(collid
     for body in innermost_loops(jaxpr):
         found = operations(body)
         assert crossings(found) == (1, 1)
-        assert set(found) <= {"stencil_resist", "stencil_scatter", "stencil_gather"}
+        assert set(found) <= {"custom_resist", "custom_scatter", "custom_gather"}
     plain, arrays = program(method, boundary=HELD["slip"])
     if collider is not mpm.SeparatingCollider:
         assert operations(jaxpr) == operations(jax.make_jaxpr(plain)(arrays).jaxpr)
 
 
-def test_in_the_total_description_a_rollout_builds_no_stencil_in_its_steps():
+def test_in_the_total_description_a_rollout_builds_no_custom_in_its_steps():
     """The first node is found by rounding down: in each step of the updated description, in none of the total one."""
     assert counted()["floor"] > 0
     assert counted(description=mpm.TotalLagrangian())["floor"] == 0
@@ -340,7 +341,7 @@ def test_viscosity_adds_no_crossing(law, transfer):
     assert jax.eval_shape(step, arrays).C is not None
     step, arrays = program(mpm.SemiImplicit(), material=viscous, transfer=transfer)
     (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
-    assert operations(body) == {"stencil_resist": 1}
+    assert operations(body) == {"custom_resist": 1}
 
 
 def test_forces_on_boundaries_add_no_crossing_to_an_explicit_step():
@@ -377,8 +378,8 @@ def reverse(method, **scene):
 
 def every(jaxpr, name):
     """All equations of a primitive, in inner programs too; the code of a derivative rule is not looked into."""
-    own = [e for e in jaxpr.eqns if e.primitive.name == name]
-    inner = [i for e in jaxpr.eqns if e.primitive.name != "ruled" for i in inner_programs(e)]
+    own = [e for e in jaxpr.eqns if name_of(e) == name]
+    inner = [i for e in jaxpr.eqns if not isinstance(e.params.get("call"), _Call) for i in inner_programs(e)]
     return sum((every(i, name) for i in inner), own)
 
 
@@ -386,7 +387,7 @@ def every(jaxpr, name):
 def test_a_gradient_repeats_no_solve(boundary):
     """Steps are computed again in reverse mode, solutions and active sets are not."""
     forward, gradient, _ = reverse(mpm.SemiImplicit(), boundary=boundary)
-    assert len(every(gradient, "ruled")) == len(every(forward, "ruled")) > 0
+    assert len(every(gradient, "custom__solve")) == len(every(forward, "custom__solve")) > 0
 
 
 def test_a_gradient_stores_no_more_than_the_state_before_each_step():
@@ -408,4 +409,4 @@ def test_segments_sum_each_step_twice_and_no_third_time():
         return (mpm.simulate(scene, block, t1=6e-3, dt=1e-3, adjoint=adjoint, throw=False).final.x ** 2).sum()
 
     found = operations(jax.make_jaxpr(jax.grad(moved))(jnp.asarray(1e5)).jaxpr)
-    assert (found["stencil_average"], found["stencil_gather"]) == (12, 12)
+    assert (found["custom_average"], found["custom_gather"]) == (12, 12)

@@ -60,13 +60,13 @@ def resistance(d, p, dtype, seed=0, *, wild=True, side=SIDE):
 
 def resisted(first, t, upper, u):
     side = round(len(u) ** (1 / len(first)))
-    return _fused_sums._resist_sum(first, t, upper, u, basis=basis_for(len(first), 3, side=side))[0]
+    return _fused_sums.resist_sum(first, t, upper, u, basis=basis_for(len(first), 3, side=side))
 
 
 def resisted_in_parts(first, t, upper, u):
     """By a gather, a matrix a particle and a scatter."""
     side = round(len(u) ** (1 / len(first)))
-    return _fused_sums._resist(first, t, upper, u, basis=basis_for(len(first), 3, side=side))[0]
+    return _fused_sums.resist_sum.function(first, t, upper, u, basis=basis_for(len(first), 3, side=side))
 
 
 def summed(basis, first, t, given, nodes, valued=True, graded=True):
@@ -77,9 +77,9 @@ def summed(basis, first, t, given, nodes, valued=True, graded=True):
     groups = (Group(basis.value),) * valued + (Group(basis.gradient),) * (graded is not False)
     both = Group(basis.value), Group(basis.gradient)
     return (
-        sums.gather_sum(first, t, nodes, basis=basis, groups=both),
-        sums.scatter_sum(first, t, *rows, basis=basis, groups=groups, size=len(nodes)),
-        sums.pull_sum(first, t, nodes, *rows, basis=basis, groups=groups, gathered=True),
+        sums.gather_sum(first, t, None, nodes, basis=basis, groups=both),
+        sums.scatter_sum(first, t, None, rows, basis=basis, groups=groups, size=len(nodes)),
+        sums.pull_sum(first, t, nodes, rows, basis=basis, groups=groups, gathered=True),
     )
 
 
@@ -172,7 +172,7 @@ def averaged(first, t, given, gradients, k=2, side=SIDE, s=3):
     if gradients is not None:
         rows, groups = [*rows, gradients[:, :k]], [*groups, Group(basis.gradient)]
     params = {"basis": basis, "groups": tuple(groups), "size": 2 * side ** len(first)}
-    return _fused_sums._average_sum(first, t, jnp.asarray(0.3, t.dtype), *rows, **params)
+    return _fused_sums.average_sum(first, t, jnp.asarray(0.3, t.dtype), rows, **params)
 
 
 @NEEDS_LIBRARY

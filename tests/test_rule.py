@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from helpers import thorough
 
-from mpmjax.autodiff._rule import ruled
+from mpmjax.autodiff import custom_derivative, is_unknown
 
 
-@ruled
+@custom_derivative
 def cube(x):
     """x³ by a loop of no derivative in x."""
     return jax.lax.while_loop(lambda c: c[0] < 1, lambda c: (c[0] + 1, c[1] ** 3), (0, jax.lax.stop_gradient(x)))[1]
@@ -23,7 +23,7 @@ def _(primals, tangents):
     return cube(x), scaled(3.0, x, x, dx)
 
 
-@ruled
+@custom_derivative
 def scaled(factor, x, y, z):
     """factor x y z, the factor fixed in the program where it is a plain number."""
     return factor * jax.lax.stop_gradient(x * y * z)
@@ -39,8 +39,8 @@ def _(primals, tangents):
 @scaled.deftranspose
 def _(cotangent, args):
     factor, *vectors = args
-    pulled = scaled(factor, *(cotangent if a is None else a for a in vectors))
-    return (None, *(pulled if a is None else None for a in vectors))
+    pulled = scaled(factor, *(cotangent if is_unknown(a) else a for a in vectors))
+    return (None, *(pulled if is_unknown(a) else None for a in vectors))
 
 
 def in_scan(f):
@@ -79,7 +79,7 @@ def test_a_batch_may_share_an_argument():
 def test_arguments_are_pytrees_of_which_what_is_no_array_is_fixed():
     """A result may have no derivative: an integer."""
 
-    @ruled
+    @custom_derivative
     def picked(choice, number):
         return {"value": choice["a"] * (2 if choice["name"] == "twice" else 1), "number": number}
 
@@ -96,7 +96,7 @@ def test_arguments_are_pytrees_of_which_what_is_no_array_is_fixed():
 
 
 def test_what_has_no_rule_says_so():
-    @ruled
+    @custom_derivative
     def bare(x):
         return x
 
@@ -107,7 +107,7 @@ def test_what_has_no_rule_says_so():
 def test_what_has_no_transpose_says_so():
     """A function with a derivative that reverse mode must transpose: forward mode works."""
 
-    @ruled
+    @custom_derivative
     def doubled(x):
         return 2 * x
 

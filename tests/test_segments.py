@@ -11,7 +11,7 @@ import pytest
 from helpers import NEEDS_LIBRARY, assert_close, thorough
 
 import mpmjax as mpm
-from mpmjax.native import materialised
+from mpmjax.autodiff import materialised
 from mpmjax.simulation._diffrax import SegmentAdjoint, checkpointed
 
 STEPS, DT = 12, 2e-3

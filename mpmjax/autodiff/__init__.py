@@ -1,9 +1,10 @@
-"""Derivative rules and guards that hold in every nest of JAX transformations."""
+"""Functions with rules and kernels of their own, and guards, that hold in every nest of JAX transformations."""
 
-from mpmjax.autodiff._guard import guard as guard
-from mpmjax.autodiff._rematerialise import (
-    rematerialised as rematerialised,
-    saved_for_backward as saved_for_backward,
-    sums_saved_for_backward as sums_saved_for_backward,
+from mpmjax.autodiff._custom_derivative import (
+    custom_derivative as custom_derivative,
+    is_unknown as is_unknown,
+    materialised as materialised,
+    without_derivative as without_derivative,
 )
-from mpmjax.autodiff._rule import ruled as ruled, without_derivative as without_derivative
+from mpmjax.autodiff._guard import guard as guard
+from mpmjax.autodiff._rematerialise import rematerialised as rematerialised, saved_for_backward as saved_for_backward

@@ -4,7 +4,7 @@ from mpmjax.discretisation._basis import Basis as Basis, basis_of as basis_of
 from mpmjax.discretisation._fused_sums import (
     average as average,
     resist as resist,
-    resist_unscaled as resist_unscaled,
+    resist_sum as resist_sum,
     without_flat as without_flat,
 )
 from mpmjax.discretisation._grid import Grid as Grid
@@ -14,7 +14,7 @@ from mpmjax.discretisation._kernel import (
     MLSGradient as MLSGradient,
     SplineGradient as SplineGradient,
 )
-from mpmjax.discretisation._native_sums import basis_attributes as basis_attributes, sums_fit as sums_fit
+from mpmjax.discretisation._native_sums import basis_attributes as basis_attributes
 from mpmjax.discretisation._stencil import (
     Stencil as Stencil,
     first_nodes as first_nodes,

@@ -4,31 +4,30 @@ Both are made of `scatter` and `gather`. On CPUs the native library has each in 
 they are, they are the reference and what other devices run.
 """
 
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._jax import instantiate_zeros
 from mpmjax._types import Array, Float, NodeVector, Scalar
-from mpmjax.autodiff import sums_saved_for_backward
+from mpmjax.autodiff import custom_derivative, saved_for_backward
 from mpmjax.discretisation._basis import Basis
-from mpmjax.discretisation._native_sums import native_average, native_resist, sums_fit
+from mpmjax.discretisation._native_sums import basis_attributes, call_average
 from mpmjax.discretisation._stencil import Stencil
 from mpmjax.discretisation._sums import (
     Group,
     gather,
     gather_sum,
     given_rows,
-    is_zero,
     scatter,
     scatter_change,
     scatter_sum,
-    sum_of_changes,
 )
-from mpmjax.native import NativeFunction
 
 
 def average(
@@ -54,52 +53,45 @@ def average(
     """
     least, columns = jnp.asarray(least, weight.dtype), jnp.concatenate([value, weight[None]])
     if stencil.own_derivatives is not None:
-        whole, means = _means(scatter(stencil, columns, gradients, size), least)
-        return whole, means
+        return _means(scatter(stencil, columns, gradients, size), least)
     groups, rows = given_rows(stencil, columns, gradients)
-    whole, means = _average_sum(
-        stencil.first, stencil.offset, least, *rows, basis=stencil.basis, groups=groups, size=size
-    )
-    return whole, means
+    basis = stencil.basis
+    return average_sum(stencil.first, stencil.offset, least, rows, basis=basis, groups=groups, size=size)
 
 
-def _means(sums: Array, least: Array) -> list[Array]:
+def _means(sums: Array, least: Array) -> tuple[Array, Array]:
     """The whole weights, (n,), and the averages, (n, k)."""
     some = sums[:, -1] > least
     whole = jnp.where(some, sums[:, -1], 0)
-    return [whole, jnp.where(some[:, None], sums[:, :-1] / jnp.where(some, whole, 1)[:, None], 0)]
+    return whole, jnp.where(some[:, None], sums[:, :-1] / jnp.where(some, whole, 1)[:, None], 0)
 
 
-def _average(first: Array, t: Array, least: Array, *rows: Array, **params: Any) -> list[Array]:
-    return _means(scatter_sum(first, t, *rows, **params)[0], least)
-
-
-def _average_jvp(primals: tuple, tangents: tuple, *, batched: int, **params: Any) -> tuple[list[Array], list[Any]]:
-    """The quotient rule on the differentials of the sums; the threshold is not differentiated. Averages are saved for
-    reverse mode here, where the rule takes them: named afterwards they would be others, and these computed again."""
-    first, t, _, *rows = primals
-    out = sums_saved_for_backward(_average_sum(*primals, batched=batched, **params))
-    changes = scatter_change(first, t, tangents[1], rows, tangents[3:], batched=batched, **params)
-    return out, sum_of_changes(out, [_divided(*change, *out) for change in changes])
-
-
-def _divided(change: Array, whole: Array, means: Array) -> list[Array]:
-    """dM and (d(Σ) − a dM) / M, (n,) and (n, k), from the differentials of the sums, (n, k + 1)."""
-    some = whole > 0
-    d_whole = jnp.where(some, change[..., -1], 0)
-    d_means = (change[..., :-1] - means * d_whole[..., None]) / jnp.where(some, whole, 1)[..., None]
-    return [d_whole, jnp.where(some[..., None], d_means, 0)]
-
-
-_average_sum = NativeFunction(
-    "average",
-    _average,
-    lambda *args, size, **_: [(size,), (size, args[3].shape[-2] - 1)],
-    sums_fit,
-    like=1,
-    native=native_average,
+@partial(
+    custom_derivative,
+    kernel="average",
+    results=lambda _, t, least, rows, size, **__: tuple(
+        jax.ShapeDtypeStruct(shape, t.dtype) for shape in ((size,), (size, rows[0].shape[1] - 1))
+    ),
+    call=call_average,
 )
-_average_sum.jvp = _average_jvp
+def average_sum(first: Array, t: Array, least: Array, rows: Sequence[Array], **params: Any) -> tuple[Array, Array]:
+    """The whole weights and the averages, of columns of which the last is the weight."""
+    return _means(scatter_sum(first, t, None, rows, **params), least)
+
+
+@average_sum.defjvp
+def _(primals: tuple, tangents: tuple, **params: Any) -> tuple[tuple[Array, Array], Any]:
+    """dM and (d(Σ) − a dM) / M; the threshold is not differentiated. Averages are saved for reverse mode here, where
+    the rule takes them: named afterwards they would be others, and these computed again."""
+    (first, t, _, rows), (_, dt, _, changes) = primals, tangents
+    whole, means = saved_for_backward(average_sum(*primals, **params), sums=True)
+    change = scatter_change(first, t, dt, rows, changes, **params)
+    if change is None:
+        return (whole, means), (None, None)
+    some = whole > 0
+    d_whole = jnp.where(some, change[:, -1], 0)
+    d_means = (change[:, :-1] - means * d_whole[:, None]) / jnp.where(some, whole, 1)[:, None]
+    return (whole, means), (d_whole, jnp.where(some[:, None], d_means, 0))
 
 
 def resist(stencil: Stencil, upper: Float[Array, "t p"], u: NodeVector) -> NodeVector:
@@ -113,8 +105,8 @@ def resist(stencil: Stencil, upper: Float[Array, "t p"], u: NodeVector) -> NodeV
     """
     if stencil.own_derivatives is not None:
         return scatter(stencil, None, _flux(upper, gather(stencil, u)[1]), len(u))
-    scaled = stencil.slope**2 * u
-    return resist_unscaled(stencil.basis, stencil.first, stencil.offset, without_flat(stencil, upper), scaled)
+    upper, scaled = without_flat(stencil, upper), stencil.slope**2 * u
+    return resist_sum(stencil.first, stencil.offset, upper, scaled, basis=stencil.basis)
 
 
 def without_flat(stencil: Stencil, upper: Float[Array, "t p"]) -> Float[Array, "t p"]:
@@ -126,41 +118,30 @@ def without_flat(stencil: Stencil, upper: Float[Array, "t p"]) -> Float[Array, "
     return jnp.where(stencil.flat[row // d] | stencil.flat[column // d], 0, upper)
 
 
-def resist_unscaled(basis: Basis, first: Array, t: Array, upper: Float[Array, "t p"], u: NodeVector) -> NodeVector:
-    """`resist` with gradients in spacings, dx² times as much, from the fields of a stencil."""
-    return _resist_sum(first, t, upper, u, basis=basis)[0]
-
-
 def _flux(upper: Array, slopes: Array) -> Array:
     return la.matmul(la.symmetric(upper), slopes.reshape(len(slopes) ** 2, 1, -1)).reshape(slopes.shape)
 
 
-def _resist(first: Array, t: Array, upper: Array, u: Array, *, basis: Basis) -> list[Array]:
+@partial(custom_derivative, kernel="resist", call=lambda call, *args, basis: call(args, basis_attributes(basis)))
+def resist_sum(first: Array, t: Array, upper: Array, u: Array, *, basis: Basis) -> Array:
+    """`resist` with gradients in spacings, dx² times as much, from the fields of a stencil."""
     groups = (Group(basis.gradient),)
-    (slopes,) = gather_sum(first, t, u, basis=basis, groups=groups)
-    return scatter_sum(first, t, _flux(upper, slopes), basis=basis, groups=groups, size=len(u))
+    (slopes,) = gather_sum(first, t, None, u, basis=basis, groups=groups)
+    return scatter_sum(first, t, None, [_flux(upper, slopes)], basis=basis, groups=groups, size=len(u))
 
 
-def _resist_jvp(primals: tuple, tangents: tuple, *, batched: int, **params: Any) -> tuple[list[Array], list[Any]]:
+@resist_sum.defjvp
+def _(primals: tuple, tangents: tuple, *, basis: Basis) -> tuple[Array, Any]:
     """By u the sum itself, linear in it; by the rest, which no iteration needs, gather's and scatter's."""
-    first, *others, u = primals
-    *changes, du = tangents[1:]
-    out, parts = _resist_sum(*primals, batched=batched, **params), []
-    if not is_zero(du):
-        parts.append(_resist_sum(first, *others, du, batched=batched, **params))
-    if not all(map(is_zero, changes)):
-        apart = _resist_sum.of_members(batched, **params)
-        along = tuple(map(instantiate_zeros, changes))
-        parts.append(jax.jvp(lambda *others: apart(first, *others, u), tuple(others), along)[1])
-    return out, sum_of_changes(out, parts)
+    (*args, u), (*changes, du) = primals, tangents
+    change = None if du is None else resist_sum(*args, du, basis=basis)
+    if any(a is not None for a in changes):
+        part = eqx.filter_jvp(lambda *args: resist_sum.function(*args, u, basis=basis), args, changes)[1]
+        change = part if change is None else change + part
+    return resist_sum(*primals, basis=basis), change
 
 
-def _resist_transpose(cotangents: list, *args: Any, **params: Any) -> list:
+@resist_sum.deftranspose
+def _(cotangent: Array, args: tuple, *, basis: Basis) -> tuple:
     """In u it is symmetric."""
-    return [None, None, None, *_resist_sum(*args[:-1], instantiate_zeros(cotangents[0]), **params)]
-
-
-_resist_sum = NativeFunction(
-    "resist", _resist, lambda *args, **_: [args[-1].shape[-2:]], sums_fit, like=1, native=native_resist
-)
-_resist_sum.jvp, _resist_sum.transpose = _resist_jvp, _resist_transpose
+    return None, None, None, resist_sum(*args[:-1], cotangent, basis=basis)

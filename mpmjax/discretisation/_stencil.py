@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, components
+from mpmjax.autodiff import materialised
 from mpmjax.discretisation._basis import Basis, basis_of
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import VARIANCE, AbstractGradient, BSpline
-from mpmjax.native import materialised
 
 
 class Stencil(eqx.Module):

@@ -21,21 +21,20 @@ Terms come in groups, each with one array of what particles give or are given, (
 components of the gradient. Offsets and gradients are in spacings; `gather` and `scatter` scale them.
 """
 
-from collections.abc import Callable, Sequence
-from functools import reduce
+from collections.abc import Sequence
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._jax import Zero, add_tangents, instantiate_zeros, is_undefined_primal
 from mpmjax._types import Array, Float
-from mpmjax.autodiff import sums_saved_for_backward
+from mpmjax.autodiff import custom_derivative, is_unknown, materialised, saved_for_backward
 from mpmjax.discretisation._basis import Basis, Term, differentiated
-from mpmjax.discretisation._native_sums import native_gather, native_pull, native_scatter, sums_fit
+from mpmjax.discretisation._native_sums import call_gather, call_pull, call_scatter
 from mpmjax.discretisation._stencil import Stencil
 from mpmjax.discretisation._written_sums import Factors, written_gather, written_pull, written_scatter
-from mpmjax.native import NativeFunction, materialised
 
 
 class Group(NamedTuple):
@@ -57,13 +56,13 @@ def gather(
     Args:
         stencil: stencil of the particles.
         nodes: f_i, shape (n, c).
-        saved: whether they are `sums_saved_for_backward`, from which JAX can transpose nothing.
+        saved: whether they are `saved_for_backward`, from which JAX can transpose nothing.
     """
     basis = stencil.basis
     if stencil.own_derivatives is None:
         groups = Group(basis.value), Group(basis.gradient)
-        out = gather_sum(stencil.first, stencil.offset, nodes, basis=basis, groups=groups)
-        (value,), gradients = materialised(sums_saved_for_backward(out)) if saved else out
+        out = gather_sum(stencil.first, stencil.offset, None, nodes, basis=basis, groups=groups)
+        (value,), gradients = materialised(saved_for_backward(out, sums=True)) if saved else out
         gradients = gradients * stencil.slope
     else:
         of = written_gather(_own_factors(stencil), (*basis.value, *basis.gradient), nodes, unroll=False)
@@ -89,7 +88,7 @@ def scatter(
     if stencil.own_derivatives is not None:
         pairs = [(group.terms, row) for group, row in zip(groups, rows, strict=True)]
         return written_scatter(_own_factors(stencil), pairs, size, unroll=False)
-    return scatter_sum(stencil.first, stencil.offset, *rows, basis=stencil.basis, groups=groups, size=size)[0]
+    return scatter_sum(stencil.first, stencil.offset, None, rows, basis=stencil.basis, groups=groups, size=size)
 
 
 def given_rows(stencil: Stencil, value: Array | None, gradients: Array | None) -> tuple[Groups, list[Array]]:
@@ -109,13 +108,7 @@ def _own_factors(stencil: Stencil) -> Factors:
     return Factors(stencil.basis.index_terms(stencil.first), tuple({(0, 0): w, (1, 0): g} for w, g in pairs))
 
 
-# The sums as written in JAX, of one member of a batch. Arguments: first nodes, t, dt where groups are moved, and then
-# f, what particles give, or both.
-
-
-def _split(groups: Groups, args: Sequence[Any]) -> tuple[Any, Sequence[Any]]:
-    """dt, None where no group is moved, and what comes after it."""
-    return (args[0], args[1:]) if any(group.moved for group in groups) else (None, args)
+# The sums, with dt where groups are moved and else None.
 
 
 def _moved(groups: Groups, moved: bool = True) -> Groups:
@@ -129,19 +122,14 @@ def _plain(groups: Groups) -> Groups:
 
 def _times(groups: Groups, rows: Sequence[Array], dt: Any) -> list[Array]:
     """Amounts for the `_plain` groups: a ⊗ dt, dt_b a of all terms for the first axis, the second, ..."""
-
-    def outer(a: Array) -> Array:
-        return jnp.concatenate([a * dt[..., b, None, None, :] for b in range(dt.shape[-2])], axis=-3)
-
-    return [outer(a) if group.moved else a for group, a in zip(groups, rows, strict=True)]
+    return [jnp.concatenate([a * by for by in dt]) if group.moved else a for group, a in zip(groups, rows, strict=True)]
 
 
 def _along(groups: Groups, out: Sequence[Array], dt: Any) -> list[Array]:
     """Σ_b dt_b a_b of what the `_plain` groups are given, the transpose of `_times`."""
 
     def inner(a: Array) -> Any:
-        parts = jnp.split(a, dt.shape[-2], axis=-3)
-        return sum(part * dt[..., b, None, None, :] for b, part in enumerate(parts))
+        return sum(part * by for part, by in zip(jnp.split(a, len(dt)), dt, strict=True))
 
     return [inner(a) if group.moved else a for group, a in zip(groups, out, strict=True)]
 
@@ -150,197 +138,185 @@ def _factors(basis: Basis, first: Array, t: Array, groups: Groups) -> Factors:
     return Factors.of(basis, first, t, [term for group in groups for term in group.terms])
 
 
-def _scatter(
-    first: Array, t: Array, *rest: Array, basis: Basis, groups: Groups, size: int, unroll: bool
-) -> list[Array]:
-    dt, rows = _split(groups, rest)
+@partial(
+    custom_derivative,
+    kernel="scatter",
+    results=lambda _, t, dt, rows, size, **__: jax.ShapeDtypeStruct((size, max(a.shape[1] for a in rows)), t.dtype),
+    call=call_scatter,
+    unrolls=True,
+)
+def scatter_sum(
+    first: Array,
+    t: Array,
+    dt: Any,
+    rows: Sequence[Array],
+    *,
+    basis: Basis,
+    groups: Groups,
+    size: int,
+    unroll: bool = False,
+) -> Array:
+    """∂B/∂f, (n, c), of what particles give to each group."""
     plain = _plain(groups)
     pairs = [(group.terms, row) for group, row in zip(plain, _times(groups, rows, dt), strict=True)]
-    return [written_scatter(_factors(basis, first, t, plain), pairs, size, unroll)]
+    return written_scatter(_factors(basis, first, t, plain), pairs, size, unroll)
 
 
-def _gather(first: Array, t: Array, *rest: Array, basis: Basis, groups: Groups, unroll: bool) -> list[Array]:
-    dt, (nodes,) = _split(groups, rest)
+@partial(
+    custom_derivative,
+    kernel="gather",
+    results=lambda _, t, dt, nodes, groups, **__: [
+        jax.ShapeDtypeStruct((len(group.terms), nodes.shape[1], t.shape[1]), t.dtype) for group in groups
+    ],
+    call=call_gather,
+    unrolls=True,
+)
+def gather_sum(
+    first: Array, t: Array, dt: Any, nodes: Array, *, basis: Basis, groups: Groups, unroll: bool = False
+) -> list[Array]:
+    """∂B/∂a, (terms, c, p) for each group."""
     plain = _plain(groups)
     terms = [term for group in plain for term in group.terms]
     of = written_gather(_factors(basis, first, t, plain), terms, nodes, unroll)
     return _along(groups, [jnp.stack([of[term] for term in group.terms]) for group in plain], dt)
 
 
-def _pull(
-    first: Array, t: Array, nodes: Array, *rows: Array, basis: Basis, groups: Groups, gathered: bool
-) -> list[Array]:
+@partial(custom_derivative, kernel="pull", call=call_pull)
+def pull_sum(
+    first: Array, t: Array, nodes: Array, rows: Sequence[Array], *, basis: Basis, groups: Groups, gathered: bool
+) -> tuple[Array, list[Array]]:
+    """∂B/∂t, (d, p), and if `gathered` ∂B/∂a of each group."""
     moved = _plain(_moved(groups))
     pairs = [
         [(some.terms[b * len(a) : (b + 1) * len(a)], a) for some, a in zip(moved, rows, strict=True)]
         for b in range(len(t))
     ]
     by_t = written_pull(_factors(basis, first, t, moved), pairs, nodes)
-    return [by_t, *(_gather(first, t, nodes, basis=basis, groups=groups, unroll=False) if gathered else [])]
+    return by_t, gather_sum.function(first, t, None, nodes, basis=basis, groups=groups) if gathered else []
 
 
-def _node_shape(*args: Any, groups: Groups, size: int, **_: Any) -> list[tuple]:
-    start = 2 + any(group.moved for group in groups)  # after dt
-    return [(size, max(a.shape[-2] for a in args[start:]))]
+# Forward mode. Of a sum of moved groups it is that of the same sum of plain ones.
 
 
-def _particle_shapes(*args: Any, groups: Groups, **_: Any) -> list[tuple]:
-    return [(len(group.terms), args[-1].shape[-1], args[0].shape[-1]) for group in groups]
-
-
-def _pull_shapes(*args: Any, groups: Groups, gathered: bool, **_: Any) -> list[tuple]:
-    return [args[1].shape[-2:], *(_particle_shapes(*args[:3], groups=groups) if gathered else [])]
-
-
-scatter_sum = NativeFunction("scatter", _scatter, _node_shape, sums_fit, like=1, native=native_scatter, unrolls=True)
-gather_sum = NativeFunction("gather", _gather, _particle_shapes, sums_fit, like=1, native=native_gather, unrolls=True)
-pull_sum = NativeFunction("pull", _pull, _pull_shapes, sums_fit, like=1, native=native_pull)
-
-
-# Forward mode.
-
-
-def is_zero(tangent: Any) -> bool:
-    """Whether a tangent or cotangent is zero as a matter of form."""
-    return type(tangent) is Zero
-
-
-def sum_of_changes(out: list[Array], parts: Sequence[Sequence[Array]]) -> list[Any]:
-    """The tangents of results, of some parts or none."""
-    zeros = [Zero(jax.typeof(o).to_tangent_aval()) for o in out]
-    return [reduce(add_tangents, part, zero) for zero, *part in zip(zeros, *parts, strict=True)]
-
-
-def _jvp_of(function: Callable[..., list[Array]], primals: tuple, tangents: tuple) -> tuple[list[Array], list[Array]]:
-    """The forward rule of a sum by that of others."""
-    return jax.jvp(function, primals, tuple(map(instantiate_zeros, tangents)))
+def _total(parts: Sequence[Any]) -> Any:
+    """The sum of parts of a change; the other parts are zero."""
+    return jax.tree.map(lambda *each: reduce(jnp.add, each), *parts)
 
 
 def scatter_change(
     first: Array, t: Array, dt: Any, rows: Sequence[Array], changes: Sequence[Any], groups: Groups, **params: Any
-) -> list[list[Array]]:
-    """The differential of a scatter of groups that are not moved, as its only part; none if nothing changes."""
-    some = [(group, da) for group, da in zip(groups, changes, strict=True) if not is_zero(da)]
+) -> Array | None:
+    """The differential of a scatter of groups that are not moved, None if nothing changes."""
+    some = [(group, da) for group, da in zip(groups, changes, strict=True) if da is not None]
     every, amounts = tuple(group for group, _ in some), [da for _, da in some]
-    if not is_zero(dt):
-        every, amounts = (*_moved(groups), *every), [dt, *rows, *amounts]
-    if not every:
-        return []
-    (change,) = scatter_sum(first, t, *amounts, groups=every, **params)
-    lacking = max(a.shape[-2] for a in rows) - change.shape[-1]  # columns that nothing which changes has
-    return [[jnp.pad(change, [(0, 0)] * (change.ndim - 1) + [(0, lacking)])]]
-
-
-def _scatter_jvp(primals: tuple, tangents: tuple, *, groups: Groups, **params: Any) -> tuple:
-    first, t, *rest = primals
-    dt, rows = _split(groups, rest)
     if dt is not None:
+        every, amounts = (*_moved(groups), *every), [*rows, *amounts]
+    if not every:
+        return None
+    change = scatter_sum(first, t, dt, amounts, groups=every, **params)
+    lacking = max(a.shape[1] for a in rows) - change.shape[1]  # columns that nothing which changes has
+    return jnp.pad(change, ((0, 0), (0, lacking)))
 
-        def plain(first: Array, t: Array, dt: Array, *rows: Array) -> list[Array]:
-            return scatter_sum(first, t, *_times(groups, rows, dt), groups=_plain(groups), **params)
 
-        return _jvp_of(plain, primals, tangents)
-    out = scatter_sum(*primals, groups=groups, **params)
-    return out, sum_of_changes(out, scatter_change(first, t, tangents[1], rows, tangents[2:], groups, **params))
+@scatter_sum.defjvp
+def _(primals: tuple, tangents: tuple, *, groups: Groups, **params: Any) -> tuple[Array, Any]:
+    if primals[2] is not None:
+
+        def plain(first: Array, t: Array, dt: Array, rows: Sequence[Array]) -> Array:
+            return scatter_sum(first, t, None, _times(groups, rows, dt), groups=_plain(groups), **params)
+
+        return eqx.filter_jvp(plain, primals, tangents)
+    (first, t, _, rows), (_, dt, _, changes) = primals, tangents
+    change = scatter_change(first, t, dt, rows, changes, groups, **params)
+    return scatter_sum(*primals, groups=groups, **params), change
 
 
-def _gather_jvp(primals: tuple, tangents: tuple, *, groups: Groups, **params: Any) -> tuple:
-    if any(group.moved for group in groups):
+@gather_sum.defjvp
+def _(primals: tuple, tangents: tuple, *, groups: Groups, **params: Any) -> tuple[list[Array], Any]:
+    if primals[2] is not None:
 
         def plain(first: Array, t: Array, dt: Array, nodes: Array) -> list[Array]:
-            return _along(groups, gather_sum(first, t, nodes, groups=_plain(groups), **params), dt)
+            return _along(groups, gather_sum(first, t, None, nodes, groups=_plain(groups), **params), dt)
 
-        return _jvp_of(plain, primals, tangents)
-    first, t, nodes = primals
-    _, dt, df = tangents
-    out = gather_sum(*primals, groups=groups, **params)
-    parts = [] if is_zero(df) else [gather_sum(first, t, df, groups=groups, **params)]
-    if not is_zero(dt):
+        return eqx.filter_jvp(plain, primals, tangents)
+    (first, t, _, nodes), (_, dt, _, df) = primals, tangents
+    parts = [] if df is None else [gather_sum(first, t, None, df, groups=groups, **params)]
+    if dt is not None:
         parts.append(gather_sum(first, t, dt, nodes, groups=_moved(groups), **params))
-    return out, sum_of_changes(out, parts)
+    return gather_sum(*primals, groups=groups, **params), _total(parts)
 
 
-def _pull_jvp(primals: tuple, tangents: tuple, *, groups: Groups, gathered: bool, **params: Any) -> tuple:
+@pull_sum.defjvp
+def _(primals: tuple, tangents: tuple, *, groups: Groups, gathered: bool, **params: Any) -> tuple:
     if gathered:
 
-        def apart(first: Array, t: Array, nodes: Array, *rows: Array) -> list[Array]:
-            by_t = pull_sum(first, t, nodes, *rows, groups=groups, gathered=False, **params)
-            return [*by_t, *gather_sum(first, t, nodes, groups=groups, **params)]
+        def apart(first: Array, t: Array, nodes: Array, rows: Sequence[Array]) -> tuple[Array, list[Array]]:
+            by_t, _ = pull_sum(first, t, nodes, rows, groups=groups, gathered=False, **params)
+            return by_t, gather_sum(first, t, None, nodes, groups=groups, **params)
 
-        return _jvp_of(apart, primals, tangents)
-    first, t, nodes, *rows = primals
-    _, dt, df, *changes = tangents
-    params["gathered"] = False
-    out = pull_sum(*primals, groups=groups, **params)
-    parts = [] if is_zero(df) else [pull_sum(first, t, df, *rows, groups=groups, **params)]
-    if not all(map(is_zero, changes)):
-        parts.append(pull_sum(first, t, nodes, *map(instantiate_zeros, changes), groups=groups, **params))
-    if not is_zero(dt):
+        return eqx.filter_jvp(apart, primals, tangents)
+    (first, t, nodes, rows), (_, dt, df, changes) = primals, tangents
+    pull = partial(pull_sum, first, t, gathered=False, **params)
+    parts = [] if df is None else [pull(df, rows, groups=groups)]
+    some = [(group, da) for group, da in zip(groups, changes, strict=True) if da is not None]
+    if some:
+        parts.append(pull(nodes, [da for _, da in some], groups=tuple(group for group, _ in some)))
+    if dt is not None:
         moved = _moved(groups)
-        parts.append(pull_sum(first, t, nodes, *_times(moved, rows, dt), groups=_plain(moved), **params))
-    return out, sum_of_changes(out, parts)
-
-
-scatter_sum.jvp, gather_sum.jvp, pull_sum.jvp = _scatter_jvp, _gather_jvp, _pull_jvp
+        parts.append(pull(nodes, _times(moved, rows, dt), groups=_plain(moved)))
+    return pull(nodes, rows, groups=groups), _total(parts)
 
 
 # Reverse mode.
 
 
-def _of_undefined(rows: Sequence[Any], out: Sequence[Array]) -> list:
+def _of_unknown(rows: Sequence[Any], out: Sequence[Array]) -> list:
     """Gathered rows for those that are asked for, in the columns that these have."""
     remaining = iter(out)
-    return [next(remaining)[..., : a.aval.shape[-2], :] if is_undefined_primal(a) else None for a in rows]
+    return [next(remaining)[:, : a.shape[1]] if is_unknown(a) else None for a in rows]
 
 
-def _scatter_transpose(
-    cotangents: list, first: Array, t: Array, *rest: Any, groups: Groups, size: int, **params: Any
-) -> list:
+@scatter_sum.deftranspose
+def _(nodes: Array, args: tuple, *, groups: Groups, size: int, **params: Any) -> tuple:
     """By dt the pull of what is moved, by what is given the gather: in one pass where both are asked for."""
     del size
-    nodes, (dt, rows) = instantiate_zeros(cotangents[0]), _split(groups, rest)
+    first, t, dt, rows = args
     pairs = list(zip(groups, rows, strict=True))
-    wanted = tuple(group for group, a in pairs if is_undefined_primal(a))
-    if dt is None or not is_undefined_primal(dt):
-        along: list[Any] = [dt] if any(group.moved for group in wanted) else []
-        out = gather_sum(first, t, *along, nodes, groups=wanted, **params)
-        return [None, None, *([] if dt is None else [None]), *_of_undefined(rows, out)]
+    wanted = tuple(group for group, a in pairs if is_unknown(a))
+    if not is_unknown(dt):
+        along = dt if any(group.moved for group in wanted) else None
+        return None, None, None, _of_unknown(rows, gather_sum(first, t, along, nodes, groups=wanted, **params))
     pulled = _moved(tuple(group for group, _ in pairs if group.moved), False)
     amounts = [a for group, a in pairs if group.moved]
     together = bool(wanted) and set(wanted) <= set(pulled)
-    by_t, *out = pull_sum(first, t, nodes, *amounts, groups=pulled, gathered=together, **params)
+    by_t, out = pull_sum(first, t, nodes, amounts, groups=pulled, gathered=together, **params)
     if together:
         out = [out[pulled.index(group)] for group in wanted]
     elif wanted:
-        out = gather_sum(first, t, nodes, groups=wanted, **params)
-    return [None, None, by_t, *_of_undefined(rows, out)]
+        out = gather_sum(first, t, None, nodes, groups=wanted, **params)
+    return None, None, by_t, _of_unknown(rows, out)
 
 
-def _gather_transpose(cotangents: list, first: Array, t: Array, *rest: Any, groups: Groups, **params: Any) -> list:
+@gather_sum.deftranspose
+def _(cotangents: list, args: tuple, *, groups: Groups, **params: Any) -> tuple:
     """By f the scatter, by dt the pull."""
-    dt, (nodes,) = _split(groups, rest)
-    some = [(group, a) for group, a in zip(groups, cotangents, strict=True) if not is_zero(a)]
+    first, t, dt, nodes = args
+    some = [(group, a) for group, a in zip(groups, cotangents, strict=True) if a is not None]
     rows, every = [a for _, a in some], tuple(group for group, _ in some)
-    if not is_undefined_primal(nodes):
-        by_t = pull_sum(first, t, nodes, *rows, groups=_moved(every, False), gathered=False, **params)
-        return [None, None, *by_t, None]
-    args = first, t, *([dt] if any(group.moved for group in every) else []), *rows
-    size = nodes.aval.shape[-2]
-    back = scatter_sum(*args, groups=every, size=size, **params) if every else [Zero(nodes.aval)]
-    return [None, None, *([] if dt is None else [None]), *back]
+    if not is_unknown(nodes):
+        by_t, _ = pull_sum(first, t, nodes, rows, groups=_moved(every, False), gathered=False, **params)
+        return None, None, by_t, None
+    along = dt if any(group.moved for group in every) else None
+    return None, None, None, scatter_sum(first, t, along, rows, groups=every, size=nodes.shape[0], **params)
 
 
-def _pull_transpose(
-    cotangents: list, first: Array, t: Array, nodes: Any, *rows: Any, groups: Groups, gathered: bool, **params: Any
-) -> list:
+@pull_sum.deftranspose
+def _(cotangents: tuple, args: tuple, *, groups: Groups, gathered: bool, **params: Any) -> tuple:
     """By f the scatter, by what is given the gather, both moved along the cotangent."""
     assert not gathered  # the forward rule takes both apart
-    dt, moved = instantiate_zeros(cotangents[0]), _moved(groups)
-    if is_undefined_primal(nodes):
-        back = scatter_sum(first, t, dt, *rows, groups=moved, size=nodes.aval.shape[-2], **params)
-        return [None, None, *back, *(None for _ in rows)]
-    wanted = tuple(group for group, a in zip(moved, rows, strict=True) if is_undefined_primal(a))
-    return [None, None, None, *_of_undefined(rows, gather_sum(first, t, dt, nodes, groups=wanted, **params))]
-
-
-scatter_sum.transpose, gather_sum.transpose, pull_sum.transpose = _scatter_transpose, _gather_transpose, _pull_transpose
+    (dt, _), (first, t, nodes, rows), moved = cotangents, args, _moved(groups)
+    if is_unknown(nodes):
+        back = scatter_sum(first, t, dt, rows, groups=moved, size=nodes.shape[0], **params)
+        return None, None, back, [None] * len(rows)
+    wanted = tuple(group for group, a in zip(moved, rows, strict=True) if is_unknown(a))
+    return None, None, None, _of_unknown(rows, gather_sum(first, t, dt, nodes, groups=wanted, **params))

@@ -8,12 +8,11 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax.autodiff import custom_derivative
 from mpmjax.implicit._hessian import AbstractHessianAction, ParticleStiffness
 from mpmjax.implicit._potential import ElasticPotential
-from mpmjax.native import NativeFunction
 
 _BLOCK_SIZE = 64  # as in native/vectors.h
 
@@ -236,43 +235,29 @@ def active_blocks(*may_differ_from_zero: Bool[Array, "m"]) -> Bool[Array, "k"]:
     return jnp.pad(some, (0, -len(some) % _BLOCK_SIZE)).reshape(-1, _BLOCK_SIZE).any(axis=1)
 
 
-def _product(*args: Array) -> list[Array]:
+def _product(*args: Array) -> tuple[Array, Array]:
     """W⁻¹A v and vᵀA v, with (A v)_i = m_i v_i + χ f_i where i is free, f = H v, and v_i elsewhere."""
     force, v, mass, factor, free, weight, _ = args
     image = jnp.where(free, jnp.repeat(mass, len(v) // max(1, len(mass))) * v + factor * force, v)
-    return [image / weight, (v * image).sum()]
+    return image / weight, (v * image).sum()
 
 
-def vectors_fit(*avals: Any, batched: int) -> bool:
-    """Whether the native library has a kernel for passes over these vectors: floats of one kind, and masks."""
-    del batched
-    floats = [aval.dtype for aval in avals if aval.dtype != np.bool_]
-    return floats[0] in (np.float32, np.float64) and set(floats) == {floats[0]}
-
-
-rest_of_product = NativeFunction(
-    "product", _product, lambda *args: [args[0].shape[-1:], ()], vectors_fit, aliases={0: 0}, differentiable=True
-)
+rest_of_product = custom_derivative(_product, kernel="product", aliases={0: 0}).differentiated_as_written()
 """The rest of a product with M + χH, once H v is known, with an inner product. In JAX these are some four passes over
 the window, of which a body may fill a small part; natively it is one, in place, that skips inactive blocks."""
 
 
-def _combine(a: Array, b: Array, c: Array, d: Array, scales: Array, weight: Array, active: Array) -> list[Array]:
+def _combine(
+    a: Array, b: Array, c: Array, d: Array, scales: Array, weight: Array, active: Array
+) -> tuple[Array, Array, Array]:
     """Two sums of two vectors with a norm. In JAX these are some four passes over the window, of which a body may fill
     a small part; natively it is one, in place, that skips inactive blocks."""
     del active
-    return [a + scales[0] * b, z := c + scales[1] * d, (weight * z * z).sum()]
+    return a + scales[0] * b, (z := c + scales[1] * d), (weight * z * z).sum()
 
 
 combine_onto = tuple(
-    NativeFunction(
-        "combine",
-        _combine,
-        lambda *args: [args[0].shape[-1:], args[0].shape[-1:], ()],
-        vectors_fit,
-        aliases={onto: 0, 2 + onto: 1},
-        differentiable=True,
-    )
+    custom_derivative(_combine, kernel="combine", aliases={onto: 0, 2 + onto: 1}).differentiated_as_written()
     for onto in (0, 1)
 )
 """`_combine`, its results in the memory of a and c, or of b and d."""

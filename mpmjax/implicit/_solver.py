@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,8 +12,9 @@ import lineax as lx
 from jax.flatten_util import ravel_pytree
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
+from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
-from mpmjax.discretisation import Basis, basis_attributes, resist_unscaled, sums_fit, without_flat
+from mpmjax.discretisation import Basis, basis_attributes, resist_sum, without_flat
 from mpmjax.implicit._hessian import ParticleStiffness
 from mpmjax.implicit._operator import (
     AbstractInnerProduct,
@@ -23,7 +25,6 @@ from mpmjax.implicit._operator import (
     rest_of_product,
 )
 from mpmjax.implicit._solve_info import AbstractInnerProductSolver, SolveInfo
-from mpmjax.native import NativeFunction, call_library
 
 DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}
 """The default relative tolerance, by bytes a number."""
@@ -276,44 +277,38 @@ def solve_particle_matrices(
     stencil = hessian.stencil
     factor = jnp.asarray(operator.factor * stencil.slope**2, b.dtype)
     args = without_flat(stencil, hessian.upper), operator.mass, factor, free, weight, active, x, b, limits
-    x, numbers = _native_solve(stencil.first, stencil.offset, *args, basis=stencil.basis)
+    x, numbers = _solve(stencil.first, stencil.offset, *args, basis=stencil.basis)
     rr, k, radius, breakdown, indefinite, correction, stalled, b_norm, x_norm = numbers
     flags = breakdown > 0, indefinite > 0
     return Iterate(x, rr, k.astype(jnp.int32), radius, *flags, correction, stalled > 0, b_norm, x_norm)
 
 
-def _solve(first: Array, t: Array, *args: Array, basis: Basis) -> list[Array]:
-    """`solve_particle_matrices`, written in JAX."""
+def _call_solve(call: Any, first: Array, t: Array, *args: Array, basis: Basis) -> list[Array]:
+    """By a kernel, with memory for six vectors. Members of a batch, which run one after the other in a thread, take
+    their own."""
+    n, dtype = args[-2].shape[-1], t.dtype
+    results = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, 9, 0 if first.ndim > 2 else 6 * n)]
+    aliases = {2 + len(args) - 3: 0}
+    return call([first, t, *args], basis_attributes(basis), results=results, aliases=aliases)[:2]
+
+
+@partial(
+    custom_derivative,
+    kernel="solve",
+    results=lambda *args, basis: (args[-2], jax.ShapeDtypeStruct((9,), args[-2].dtype)),
+    call=_call_solve,
+)
+def _solve(first: Array, t: Array, *args: Array, basis: Basis) -> tuple[Array, Array]:
+    """`solve_particle_matrices`, written in JAX. Solves are not differentiated through their iterations."""
     upper, mass, factor, free, weight, active, x, b, limits = args
 
-    def product(u: Array) -> list[Array]:
+    def product(u: Array) -> tuple[Array, Array]:
         moved = jnp.where(free, u, 0).reshape(len(mass), -1)
-        force = resist_unscaled(basis, first, t, upper, moved).reshape(-1)
+        force = resist_sum(first, t, upper, moved, basis=basis).reshape(-1)
         return rest_of_product(force, u, mass, factor, free, weight, active)
 
     end = conjugate_residual(diagonal(product, weight, active), b, x, limits[0], limits[1])
-    return [end.x, jnp.stack([a.astype(b.dtype) for a in end[1:10]])]
-
-
-def _call_solve(first: Array, t: Array, *args: Array, basis: Basis, batched: int) -> list[Array]:
-    """By the library, with memory for six vectors. Members of a batch, which run one after the other in a thread, take
-    their own."""
-    results = _native_solve.results(first, t, *args, basis=basis, batched=batched)
-    memory = (*first.shape[:batched], 0 if batched else 6 * args[-3].shape[-1]), t.dtype
-    aliases = {2 + len(args) - 3: 0}
-    return call_library("solve", [first, t, *args], [*results, memory], basis_attributes(basis), aliases)[:2]
-
-
-# The derivative is that of the loop in JAX, and never taken: solves are not differentiated through their iterations.
-_native_solve = NativeFunction(
-    "solve",
-    _solve,
-    lambda *args, basis: [args[-3].shape[-1:], (9,)],
-    sums_fit,
-    like=1,
-    native=_call_solve,
-    differentiable=True,
-)
+    return end.x, jnp.stack([a.astype(b.dtype) for a in end[1:10]])
 
 
 def solve_linear(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
-from mpmjax.autodiff import ruled, saved_for_backward, without_derivative
+from mpmjax.autodiff import custom_derivative, saved_for_backward, without_derivative
 from mpmjax.checks import require_fields
 from mpmjax.implicit._hessian import AbstractHessian, AbstractHessianAction
 from mpmjax.implicit._operator import AbstractPreconditioner, ImplicitOperator, Projection
@@ -196,7 +196,7 @@ class Reporting(eqx.Module):
     """Zero."""
 
 
-@ruled
+@custom_derivative
 def solve(
     problem: StageProblem,
     slot: Array,

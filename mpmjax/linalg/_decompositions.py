@@ -1,13 +1,13 @@
 """Decompositions of small matrices: eigenvalues and eigenvectors, the polar decomposition, signed singular values."""
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from mpmjax._types import Array, Compliance, Float, Matrix
-from mpmjax.autodiff import ruled
+from mpmjax.autodiff import custom_derivative
 from mpmjax.linalg._matrices import (
     assemble,
     cofactor,
@@ -21,7 +21,6 @@ from mpmjax.linalg._matrices import (
     trace,
     transpose,
 )
-from mpmjax.native import NativeFunction
 
 _SWEEPS = {1: 0, 2: 1, 3: 4}  # by dimension: in 2-D one rotation is the closed form; 3-D converges quadratically
 _NEWTON_STEPS = 30  # on the quartic of the 3-D rotation: halves the error at a double root, else squares it
@@ -48,11 +47,11 @@ def symmetric_eigen(S: Matrix) -> tuple[Array, Matrix]:
     if len(S) != 3:
         w, V = _jacobi(S)
     else:
-        w, V = _native_eigen(S.reshape(3, 3, -1))
+        w, V = _eigen_3d(S.reshape(3, 3, -1))
     return w.reshape(S.shape[1:]), V.reshape(S.shape)
 
 
-def _jacobi(S: Matrix) -> list[Array]:
+def _jacobi(S: Matrix) -> tuple[Array, Matrix]:
     d = len(S)
 
     def sweep(_: Array | int, state: tuple[Matrix, Matrix]) -> tuple[Matrix, Matrix]:
@@ -73,10 +72,15 @@ def _jacobi(S: Matrix) -> list[Array]:
         return assemble(A), assemble(V)
 
     A, V = jax.lax.fori_loop(0, _SWEEPS[d], sweep, (S, identity_like(S)))
-    return [jnp.stack([A[i, i] for i in range(d)]), V]
+    return jnp.stack([A[i, i] for i in range(d)]), V
 
 
-@ruled
+_eigen_3d = custom_derivative(
+    _jacobi, kernel="eigen", results=lambda S: (jax.ShapeDtypeStruct(S.shape[1:], S.dtype), S)
+)
+
+
+@custom_derivative
 def rotation(F: Matrix) -> Matrix:
     """The rotation R of the polar decomposition F = R S, with det R = +1.
 
@@ -103,8 +107,7 @@ def rotation(F: Matrix) -> Matrix:
         case 2:
             return _rotation_2d(F)
         case _:
-            (R,) = _native_rotation(F.reshape(3, 3, -1))
-            return R.reshape(F.shape)
+            return _rotation_3d(F.reshape(3, 3, -1)).reshape(F.shape)
 
 
 @rotation.defjvp
@@ -164,7 +167,8 @@ def _rotation_2d(F: Matrix) -> Matrix:
     return assemble([[cos, -sin], [sin, cos]])
 
 
-def _rotation_3d(F: Matrix) -> list[Array]:
+@partial(custom_derivative, kernel="rotation", results=lambda F: F)
+def _rotation_3d(F: Matrix) -> Matrix:
     size = jnp.sqrt(double_dot(F, F))
     F = F / jnp.where(size == 0, 1, size)  # ‖F‖ = 1 from here on
     q = _dominant_quaternion(F, _largest_root(F))
@@ -173,7 +177,7 @@ def _rotation_3d(F: Matrix) -> list[Array]:
         x, y, z = _spin(R, spin_compliance(matmul(transpose(R), F)), F)
         near = x * x + y * y + z * z < 0.1  # not where R is hardly determined
         q = _normalised([a + jnp.where(near, b / 2, 0) for a, b in zip(q, _times_spin(q, (x, y, z)), strict=True)])
-    return [_rotation_of(q)]
+    return _rotation_of(q)
 
 
 def _largest_root(F: Matrix) -> Array:
@@ -238,7 +242,7 @@ def _rotation_of(q: list[Array]) -> Matrix:
     )
 
 
-@ruled
+@custom_derivative
 def principal_frame(F: Matrix) -> tuple[Matrix, Array, Matrix]:
     """F = U diag(s) Vᵀ with rotations U and V: the singular value decomposition with signed stretches.
 
@@ -278,12 +282,3 @@ def principal_modes(U: Matrix, V: Matrix) -> Float[Array, "m d d *p"]:
     twists = [half * (outer[i, j] - outer[j, i]) for i, j in pairs(d)]
     flips = [half * (outer[i, j] + outer[j, i]) for i, j in pairs(d)]
     return jnp.stack([*(outer[i, i] for i in range(d)), *twists, *flips])
-
-
-def _fits(aval: Any, *, batched: int) -> bool:
-    """Whether the library has a kernel for these: 3 x 3, of single or double precision."""
-    return aval.shape[batched : batched + 2] == (3, 3) and aval.dtype in (np.float32, np.float64)
-
-
-_native_eigen = NativeFunction("eigen", _jacobi, lambda S: [S.shape[-2:], S.shape[-3:]], _fits)
-_native_rotation = NativeFunction("rotation", _rotation_3d, lambda F: [F.shape[-3:]], _fits)

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Matrix
-from mpmjax.autodiff import ruled
+from mpmjax.autodiff import custom_derivative, is_unknown
 from mpmjax.linalg._decompositions import symmetric_eigen
 from mpmjax.linalg._matrices import matmul, transpose
 
@@ -136,7 +136,7 @@ class _Partial(AbstractSpectral):
         return jax.jvp(value, (self.function,), (jax.tree.unflatten(tree, ones),))[1]
 
 
-@ruled
+@custom_derivative
 def _differential(f: AbstractSpectral, S: Matrix, frame: Frame, directions: tuple[Matrix, ...]) -> Matrix:
     """Dⁿf(S)[A, B, ...] in n directions. It is computed from the frame, and differentiated with respect to S."""
     del S
@@ -171,7 +171,7 @@ def _differential_jvp(primals: Any, tangents: Any) -> Any:
 @_differential.deftranspose
 def _differential_transpose(cotangent: Matrix, args: Any) -> Any:
     f, S, frame, A = args
-    wanted = [direction is None for direction in A]
+    wanted = [is_unknown(direction) for direction in A]
     others = [cotangent if want else transpose(direction) for want, direction in zip(wanted, A, strict=True)]
     pulled = _differential(f, S, frame, tuple(others))
     nothing = jax.tree.map(lambda _: None, (f, S, frame))

@@ -12,7 +12,7 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix
-from mpmjax.autodiff import ruled
+from mpmjax.autodiff import custom_derivative
 
 _STRETCHES = (1.25, 0.8, 1.0)
 """Where a law is asked whether it is isotropic: they differ and keep the volume, whose energy may hide the rest."""
@@ -166,7 +166,7 @@ def isotropic_matrix(law: Any, F: Matrix, A: Matrix, weight: Float[Array, "*p"])
     return jnp.concatenate([row(b, a) for b in range(d) for a in range(d)])
 
 
-@ruled
+@custom_derivative
 def projected_matrix(law: Any, F: Matrix) -> Float[Array, "m m *p"]:
     """A⁺, A being ∂²Ψ/∂F∂F of an isotropic law at F, with its negative eigenvalues set to zero. In closed form: no
     eigenvalue problem larger than d x d is solved.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, PerParticle, Scalar
-from mpmjax.autodiff import ruled
+from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import require_between, require_fields, require_positive
 from mpmjax.material._hencky import AbstractHenckyPlasticity
 
@@ -139,7 +139,7 @@ _NEWTON_STEPS = 8
 """Enough for 1e-15 at exponents from 0.1 to 4."""
 
 
-@ruled
+@custom_derivative
 def _share_of_flow(c: Array, n: Array) -> Array:
     """w [-] of w + c wⁿ = 1, by Newton's method for ln(w + c wⁿ) = 0 in ln w: a convex function, of slope between 1 and
     n, that starts beyond its root, so each iterate is nearer.

@@ -1,9 +1,3 @@
-"""The compiled library of CPUs: whether there is one, and how JAX calls it."""
+"""Back ends: who evaluates what has kernels, and the library of CPUs."""
 
-from mpmjax.native._function import (
-    NativeFunction as NativeFunction,
-    call_library as call_library,
-    materialised as materialised,
-    ranks_may_differ as ranks_may_differ,
-)
-from mpmjax.native._library import Backend as Backend, backend as backend, is_native as is_native
+from mpmjax.native._backend import BACKENDS as BACKENDS, AbstractBackend as AbstractBackend, backend as backend

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.autodiff import ruled
+from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import require
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import Motion, spinning
@@ -33,7 +33,7 @@ class MirrorPlace(NamedTuple):
     """How it moves; None if it rests."""
 
 
-@ruled
+@custom_derivative
 def carried_by(*places: Array) -> Float[Array, ""]:
     """How far the grid is carried along an axis by the mirrors across it, at these coordinates [m]: zero, with the
     derivative by the place of a mirror. A mirror lies on the lattice of nodes, so where it is elsewhere the lattice is

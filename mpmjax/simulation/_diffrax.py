@@ -14,10 +14,9 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Int, Scalar, components, particle_first
-from mpmjax.autodiff import rematerialised
+from mpmjax.autodiff import materialised, rematerialised
 from mpmjax.boundary import Impulses, no_impulses
 from mpmjax.discretisation import Stencil, in_window
-from mpmjax.native import materialised
 from mpmjax.simulation._run import Fault, RunStatistics, no_steps, one_step
 from mpmjax.simulation._sorting import MemoryOrder, resorted
 from mpmjax.state import Particles, Scene, State, state_of, with_state

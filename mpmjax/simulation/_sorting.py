@@ -6,18 +6,18 @@ returned, saved or observed has the order in which the particles were given.
 
 import os
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from equinox.internal import unvmap_any
 
-from mpmjax._jax import Zero, instantiate_zeros
 from mpmjax._types import Array, Bool, Float, Int, ParticleVector, Scalar, components, particle_first
+from mpmjax.autodiff import custom_derivative
 from mpmjax.discretisation import BSpline, Grid, basis_of, first_nodes
-from mpmjax.native import NativeFunction, is_native
+from mpmjax.native import backend
 from mpmjax.state import AttachedPoints, Particles, Scene, State, by_material, is_foreign
 
 Order = Int[Array, "p"]  # the number of the particle that comes first, second, ..
@@ -72,7 +72,9 @@ def memory_order(scene: Scene, particles: Particles, steps: int) -> MemoryOrder 
         raise ValueError(f"{VARIABLE} must be given, or not be set, got {asked!r}.")
     mixes = not scene.total and any(not law.allows_total for law in scene.laws)
     countable = LEAST <= particles.count <= 2 ** (jnp.finfo(particles.x.dtype).nmant + 1)
-    if asked or not mixes or not countable or scene.body_force is not None or steps < FEWEST or not is_native():
+    if asked or not mixes or not countable or scene.body_force is not None or steps < FEWEST:
+        return None
+    if not backend().gains_from_order:
         return None
 
     parameters = []
@@ -159,9 +161,10 @@ def cells_of(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVe
     return basis_of(kernel, grid).index_terms(first)[:, 0].sum(axis=0, dtype=jnp.int32)
 
 
+@partial(custom_derivative, kernel="order")
 def by_cell(cells: Int[Array, "p"]) -> Order:
     """The numbers of the particles cell after cell, and in a cell in their order, shape (p,)."""
-    return _native_sort(cells)[0]
+    return jnp.argsort(cells, stable=True).astype(cells.dtype)
 
 
 def rearranged(wanted: Bool[Array, ""], order: Order, a: Float[Array, "p ..."]) -> Float[Array, "p ..."]:
@@ -171,43 +174,24 @@ def rearranged(wanted: Bool[Array, ""], order: Order, a: Float[Array, "p ..."]) 
     what either branch returns. It is done component by component, as a step has its arrays: XLA would transpose them.
     """
     rows = components(a).reshape(-1, len(a))
-    moved = _native_rearrange(wanted, order, rows, inverse=False)[0]
+    moved = _rearrange(wanted, order, rows, inverse=False)
     return particle_first(moved.reshape(*a.shape[1:], len(a)))
 
 
-def _rearrange(wanted: Array, order: Array, rows: Array, *, inverse: bool) -> list[Array]:
+@partial(custom_derivative, kernel="rearrange", aliases={2: 0})
+def _rearrange(wanted: Array, order: Array, rows: Array, *, inverse: bool) -> Array:
     moved = rows.at[:, order].set(rows, mode="drop") if inverse else rows.at[:, order].get(mode="clip")
-    return [jnp.where(wanted, moved, rows)]
+    return jnp.where(wanted, moved, rows)
 
 
-def _jvp(primals: tuple, tangents: tuple, *, batched: int, inverse: bool) -> tuple[list[Array], list[Any]]:
+@_rearrange.defjvp
+def _(primals: tuple, tangents: tuple, *, inverse: bool) -> tuple[Array, Any]:
     """By the rows, in which it is linear."""
-    wanted, order, _ = primals
-    out = _native_rearrange(*primals, batched=batched, inverse=inverse)
-    if type(tangents[2]) is Zero:
-        return out, [Zero(jax.typeof(o)) for o in out]
-    return out, _native_rearrange(wanted, order, tangents[2], batched=batched, inverse=inverse)
+    change = tangents[2] if tangents[2] is None else _rearrange(*primals[:2], tangents[2], inverse=inverse)
+    return _rearrange(*primals, inverse=inverse), change
 
 
-def _transpose(cotangents: list, wanted: Any, order: Any, rows: Any, *, batched: int, inverse: bool) -> list:
+@_rearrange.deftranspose
+def _(cotangent: Array, args: tuple, *, inverse: bool) -> tuple:
     """The other order."""
-    del rows
-    back = _native_rearrange(wanted, order, instantiate_zeros(cotangents[0]), batched=batched, inverse=not inverse)
-    return [None, None, *back]
-
-
-_native_sort = NativeFunction(
-    "order",
-    lambda cells: [jnp.argsort(cells, stable=True).astype(cells.dtype)],
-    lambda cells: [cells.shape[-1:]],
-    lambda cells, batched: cells.dtype == np.int32,
-)
-_native_rearrange = NativeFunction(
-    "rearrange",
-    _rearrange,
-    lambda wanted, order, rows, inverse: [rows.shape[-2:]],
-    lambda wanted, order, rows, **_: order.dtype == np.int32 and rows.dtype in (np.float32, np.float64),
-    like=2,
-    aliases={2: 0},
-)
-_native_rearrange.jvp, _native_rearrange.transpose = _jvp, _transpose
+    return None, None, _rearrange(*args[:2], cotangent, inverse=not inverse)

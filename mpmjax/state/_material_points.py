@@ -10,10 +10,10 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix
+from mpmjax.autodiff import materialised
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, Stencil, gather, make_stencil, scatter
 from mpmjax.material import AbstractDifferential, AbstractLaw, AbstractMaterial, Viscosity
-from mpmjax.native import materialised
 from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror
 
 
