@@ -21,7 +21,7 @@ from mpmjax.discretisation._basis import basis_of
 from mpmjax.discretisation._sums import Group
 from mpmjax.implicit import ImplicitOperator, ParticleStiffness, Projection, _solver as solver
 from mpmjax.implicit._operator import active_blocks, combine_onto, rest_of_product
-from mpmjax.native import _library
+from mpmjax.native import AbstractBackend, _backend, _library
 from mpmjax.potential import Mirror
 
 ROOT = Path(__file__).parents[1]
@@ -510,6 +510,35 @@ def test_one_variable_chooses(choose):
     choose("cuda")
     with pytest.raises(ValueError, match="must be native or xla"):
         mpm.native.backend()
+
+
+def test_another_back_end_is_one_class(choose, monkeypatch):
+    """It is asked for by its name, has some kernels, also of a batch, and XLA does what it has not."""
+
+    class Sevens(AbstractBackend):
+        name = "sevens"
+        platform = "cpu"
+
+        def has(self, kernel, arrays, *, basis=None, **params):
+            return kernel == "gather" and len(basis.shape) == 2
+
+        def call(self, kernel, operands, results, attributes, aliases=None):
+            assert len({a.ndim for a in operands}) == 1  # with the leading axes of a batch
+            return [jnp.full(a.shape, 7, a.dtype) for a in results]
+
+    monkeypatch.setattr(_backend, "BACKENDS", (Sevens,))
+    with pytest.raises(ValueError, match="must be sevens or xla, or not be set, got 'native'"):
+        choose("native"), mpm.native.backend()
+    of = partial(summed, basis_for(2, 3))
+    args = problem(2, 3, 3, 10, "float32", wild=False)
+    choose("xla")
+    _, scattered, _ = jax.jit(of)(*args)
+    choose("sevens")
+    assert mpm.native.backend().name == "sevens"
+    gathered, same, _ = jax.jit(of)(*args)
+    np.testing.assert_array_equal(same, scattered)
+    assert all((a == 7).all() for a in (*gathered, *jax.jit(jax.vmap(of))(*(a[None] for a in args))[0]))
+    assert not (jax.jit(partial(summed, basis_for(1, 3)))(*problem(1, 3, 3, 10, "float32"))[0][0] == 7).any()
 
 
 @pytest.fixture
