@@ -20,14 +20,13 @@ class Displacement:
     def __init__(self, stencil: Stencil, size: int, nodes: NodeVector | None = None):
         """A field of n = `size` nodes, (n, d); None for zero, which spares the gather."""
         self.stencil, self.size, self.at_rest = stencil, size, nodes is None
-        self._nodes = nodes
+        if nodes is not None:
+            self.nodes = nodes
 
     @cached_property
     def nodes(self) -> NodeVector:
         """u_i, shape (n, d)."""
-        if self._nodes is None:
-            return jnp.zeros((self.size, self.stencil.dim), self.stencil.offset.dtype)
-        return self._nodes
+        return jnp.zeros((self.size, self.stencil.dim), self.stencil.offset.dtype)
 
     @cached_property
     def at_particles(self) -> tuple[Float[Array, "d p"], Float[Array, "d d p"]]:

@@ -11,7 +11,7 @@ from mpmjax.autodiff import saved_for_backward, without_derivative
 from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, count_places, find_active_set
 from mpmjax.implicit import SolveInfo, no_solve
 from mpmjax.stepping._implicit_integrators import AbstractImplicitIntegrator
-from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion, advance
+from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
 
 
@@ -78,7 +78,7 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     def solve(
         held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
     ) -> tuple[ConstrainedNodes, NodeMotion, NodeMotion, SolveInfo]:
-        motion, info = advance(replace(held.nodes, friction=StageFriction(held)), method, guess)
+        motion, info = method.advance(replace(held.nodes, friction=StageFriction(held)), guess)
         motion = solved = jax.tree.map(held.images.unfold, motion)
         if motion.friction is not None:
             solved = replace(motion, velocity=motion.velocity - motion.friction)
