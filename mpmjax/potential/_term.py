@@ -195,10 +195,6 @@ class AbstractSpring(AbstractTerm, AbstractStiffness):
     def spread(self, amount: Array, size: int) -> Forces:
         """Nᵀ a."""
 
-    @abc.abstractmethod
-    def spread_square(self, amount: Array, size: int) -> Forces:
-        """Σ_s N_si² a_s, approximately (see `diagonal`)."""
-
     def stretched(self, moved: Displacement) -> Array:
         """e + N u [m]."""
         return self.stretch if moved.at_rest else self.stretch + self.elongation(moved)
@@ -218,7 +214,3 @@ class AbstractSpring(AbstractTerm, AbstractStiffness):
 
     def is_positive_semidefinite(self) -> bool:
         return True
-
-    def diagonal(self, stencil: Stencil, size: int) -> Forces:
-        del stencil
-        return self.spread_square(self.stiffness, size)

@@ -17,7 +17,7 @@ from mpmjax.geometry import moment
 from mpmjax.material import Freedom
 from mpmjax.potential import Image, RigidImage
 from mpmjax.state import Particles, Scene
-from mpmjax.stepping._grid_update import GridUpdate, elastic_impulse, reaction
+from mpmjax.stepping._grid_update import GridUpdate, reaction
 from mpmjax.stepping._integrator import AbstractIntegrator
 from mpmjax.stepping._nodes import Nodes, places_of
 
@@ -55,7 +55,7 @@ def impulse_on_boundaries(
     whole, elastic = new.solved, new.elastic
     if nodes.mirror.images:  # of all nodes
         whole = jax.tree.map(nodes.mirror.unfold, whole)
-        elastic = elastic_impulse(unfolded, method, whole)
+        elastic = None if unfolded.f is None else method.elastic_impulse(unfolded, whole)
     residual = reaction(unfolded, whole, elastic)
     grid, window, dt = scene.grid, scene.window(particles), nodes.dt
     each = enumerate(scene.boundary)
