@@ -75,7 +75,7 @@ class Nodes(AbstractNodes):
 
     @property
     def acceleration(self) -> Array:
-        """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
+        """Body acceleration g [m/s²], shape (d,) or (n, d)."""
         return self._apart(self.g)
 
     def _apart(self, field: Any) -> Any:
