@@ -173,12 +173,8 @@ def _rotation_3d(F: Matrix) -> list[Array]:
         x, y, z = _spin(R, spin_compliance(matmul(transpose(R), F)), F)
         near = x * x + y * y + z * z < 0.1  # not where R is hardly determined
         a, b, c, d = q
-        turned = [
-            -b * x - c * y - d * z,
-            a * x + c * z - d * y,
-            a * y + d * x - b * z,
-            a * z + b * y - c * x,
-        ]  # q (0, ω)
+        # the quaternion product of q with (0, ω)
+        turned = [-b * x - c * y - d * z, a * x + c * z - d * y, a * y + d * x - b * z, a * z + b * y - c * x]
         q = _normalised([old + jnp.where(near, new / 2, 0) for old, new in zip(q, turned, strict=True)])
     return [_rotation_of(q)]
 
