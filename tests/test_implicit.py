@@ -1,5 +1,7 @@
 """The implicit updates: what they solve, how they relate, and what they report."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -244,8 +246,11 @@ def test_newton_gives_up_after_thirty_halvings():
 
 def test_reports_of_two_solves_are_added_up():
     """Costs are summed and negative curvature is remembered; the quality is that of the later, or of the worse one."""
-    one = SolveInfo(*map(jnp.asarray, (5, 2, 1, 0.3, False, True, True, 0.0)))
-    two = SolveInfo(*map(jnp.asarray, (7, 3, 4, 0.1, True, False, False, 0.0)))
+    names = [field.name for field in dataclasses.fields(SolveInfo)]
+    one, two = (
+        SolveInfo(**dict(zip(names, map(jnp.asarray, values), strict=True)))
+        for values in ((5, 2, 1, 0.3, False, True, True, 0.0), (7, 3, 4, 0.1, True, False, False, 0.0))
+    )
     for first, second in ((one, two), (two, one)):
         after, both = first.followed_by(second), first.together_with(second)
         for total in (after, both):

@@ -24,7 +24,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractSpringContact, ConstrainedNodes
 from mpmjax.boundary._friction import friction_share
-from mpmjax.discretisation import Grid
+from mpmjax.discretisation import Grid, Stencil
 from mpmjax.potential import AbstractSpring, Displacement, Forces, Mirror
 
 _SAMPLES = 256
@@ -150,8 +150,9 @@ class Coupling(AbstractSpring):
     def spread(self, amount: Float[Array, "m"], size: int) -> Forces:
         return self._on_both(self.patch.spread(amount[:, None] * self.normal), -1, size)
 
-    def spread_square(self, amount: Float[Array, "m"], size: int) -> Forces:
-        return self._on_both(self.patch.spread_square(amount[:, None] * self.normal**2), 1, size)
+    def diagonal(self, stencil: Stencil, size: int) -> Forces:
+        del stencil
+        return self._on_both(self.patch.spread_square(self.stiffness[:, None] * self.normal**2), 1, size)
 
     def _on_both(self, force: Float[Array, "m d"], sign: int, size: int) -> Forces:
         first, second = self.pair

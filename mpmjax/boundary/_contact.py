@@ -18,7 +18,7 @@ of several stages may let it act after each (see `TRBDF2`).
 """
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from itertools import groupby, permutations
@@ -317,23 +317,19 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         pairs = zip(contacts, self.active, strict=True)
         frictions = [contact.friction(rubbing, active, residual) for contact, active in pairs]
 
-        def changes(order: Sequence[int]) -> list[NodeVector]:
+        numbers = [-1 - k if number is None else number for k, number in enumerate(nodes.brought_by)]
+        forth = [(k, friction) for k, friction in enumerate(frictions) if friction is not None]
+        groups = [list(group) for _, group in groupby(forth, key=lambda pair: numbers[pair[0]])]
+        orders, by_order = list(permutations(groups)) if len(groups) <= 3 else [groups, groups[::-1]], []
+        for order in orders:
             rubbed, by_contact = v, [jnp.zeros_like(v)] * len(contacts)
-            for k in order:
-                friction = frictions[k]
-                assert friction is not None  # `forth` has no others
+            for k, friction in (pair for group in order for pair in group):
                 change = friction(tied.unfold(rubbed))
                 if tied.images:  # the impulses on a rigid body's nodes are those on the whole of it
                     mass, impulse = nodes.mass[:, None], tied.fold(rubbing.nodes.mass[:, None] * change)
                     change = nodes.projection.combine(jnp.where(mass > 0, impulse / jnp.where(mass > 0, mass, 1), 0), 0)
                 rubbed, by_contact[k] = rubbed + change, change
-            return by_contact
-
-        numbers = [-1 - k if number is None else number for k, number in enumerate(nodes.brought_by)]
-        forth = [k for k in range(len(contacts)) if frictions[k] is not None]
-        groups = [list(group) for _, group in groupby(forth, key=lambda k: numbers[k])]
-        orders = list(permutations(groups)) if len(groups) <= 3 else [groups, groups[::-1]]
-        by_order = [changes([k for group in order for k in group]) for order in orders]
+            by_order.append(by_contact)
         total = [reduce(jnp.add, each) / len(orders) for each in zip(*by_order, strict=True)]
         return self.images.unfold(sum(total, v)), tuple(map(self.images.unfold, total))
 

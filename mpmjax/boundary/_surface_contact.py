@@ -131,10 +131,10 @@ class Springs(AbstractSpring):
         del size
         return Forces(value=along(amount) * self.normal, slopes=-amount.sum(axis=0) * self.arm[:, None] * self.normal)
 
-    def spread_square(self, amount: Float[Array, "s p"], size: int) -> Forces:
+    def diagonal(self, stencil: Stencil, size: int) -> Forces:
         """Without the products of weights and their derivatives."""
-        del size
-        k = amount.sum(axis=0)
+        del stencil, size
+        k = self.stiffness.sum(axis=0)
         return Forces(value=k * self.normal**2, slopes=k * (self.arm[:, None] * self.normal) ** 2)
 
 

@@ -1,7 +1,6 @@
 """Nested dissection: the factor of a matrix that couples near nodes of a box, and the order of its elimination."""
 
 import functools
-import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -59,7 +58,7 @@ class Dissection(eqx.Module):
     @property
     def entries(self) -> int:
         """How many numbers the factor has."""
-        return self.materials**2 * _entries(_best(self.shape, self.reach), self.reach)[0]
+        return self.materials**2 * _best(self.shape, self.reach)[0]
 
 
 class DissectedFactor(eqx.Module):
@@ -97,10 +96,31 @@ def dissected_factor(dissection: Dissection, entries: Callable[[Array, Array], F
         dissection: the order.
         entries: the entries of S in these rows and columns, of which some are past the last one.
     """
-    inverse, below, left = [], [], None
+    inverse, below, left = [], [], None  # what the fronts of a level take from the rest of S, shape (f, b, b)
     for level in dissection.levels:
         eliminated = level.eliminated.shape[1]
-        F, rest = _assembled(dissection.size, level, entries, left)
+
+        def columns(numbers: Array, eliminated: int = eliminated) -> Array:
+            """S in the columns of a front, and the identity in those past the last."""
+            F = entries(numbers, numbers[:eliminated])
+            return F + jnp.eye(*F.shape, dtype=F.dtype) * (numbers[:eliminated] >= dissection.size).astype(F.dtype)
+
+        def front(one: tuple[Array, Array, Array], eliminated: int = eliminated) -> tuple[Array, Array]:
+            """Those columns and those of its border, with what the two fronts before took."""
+            numbers, pair, places = one
+            F = columns(numbers, eliminated)
+            rest = jnp.zeros((), F.dtype)
+            for taken, place in zip(pair, places, strict=True):
+                rows = jnp.pad(taken, (0, 1))[place]
+                F, rest = F + rows[:, place[:eliminated]], rest + rows[eliminated:, place[eliminated:]]
+            return F, rest
+
+        numbers = jnp.asarray(np.concatenate([level.eliminated, level.border], axis=1))
+        if left is None or level.places is None:
+            F, rest = jax.lax.map(columns, numbers), jnp.zeros(())
+        else:
+            pairs = left.reshape(-1, 2, *left.shape[1:])
+            F, rest = jax.lax.map(front, (numbers, pairs, jnp.asarray(level.places)))
         L = jnp.linalg.cholesky(F[:, :eliminated])
         X = solve_triangular(L, jnp.broadcast_to(jnp.eye(eliminated, dtype=F.dtype), L.shape), lower=True)
         Y = jnp.einsum("fbo,fpo->fbp", F[:, eliminated:], X)
@@ -110,134 +130,81 @@ def dissected_factor(dissection: Dissection, entries: Callable[[Array, Array], F
     return DissectedFactor(tuple(inverse), tuple(below), dissection)
 
 
-def _assembled(
-    size: int, level: Level, entries: Callable[[Array, Array], Array], left: Array | None
-) -> tuple[Float[Array, "f m o"], Array]:
-    """The rest of S in the columns of each front, whose numbers past the last are those of the identity, and what
-    the fronts before take from the border, shape (f, b, b), or a zero.
-
-    Args:
-        size: how many numbers S has.
-        level: the fronts.
-        entries: the entries of S.
-        left: what those before take, shape (2f, b, b); None at the first level.
-    """
-    eliminated = level.eliminated.shape[1]
-
-    def columns(numbers: Array) -> Array:
-        F = entries(numbers, numbers[:eliminated])
-        return F + jnp.eye(*F.shape, dtype=F.dtype) * (numbers[:eliminated] >= size).astype(F.dtype)
-
-    def front(one: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        numbers, pair, places = one
-        F = columns(numbers)
-        rest = jnp.zeros((), F.dtype)
-        for taken, place in zip(pair, places, strict=True):
-            rows = jnp.pad(taken, (0, 1))[place]
-            F = F + rows[:, place[:eliminated]]
-            rest = rest + rows[eliminated:, place[eliminated:]]
-        return F, rest
-
-    numbers = jnp.asarray(np.concatenate([level.eliminated, level.border], axis=1))
-    if left is None or level.places is None:
-        F = jax.lax.map(columns, numbers)
-        return F, jnp.zeros((), F.dtype)
-    return jax.lax.map(front, (numbers, left.reshape(-1, 2, *left.shape[1:]), jnp.asarray(level.places)))
+_Front = tuple[np.ndarray, np.ndarray]
+"""A box, its first node and the one past its last, shape (2, d), and the separator that cuts it; twice the box if
+nothing does."""
 
 
-class _Box(NamedTuple):
-    """A box of nodes, its border, and the separator that cuts it; the whole box if nothing does."""
-
-    low: tuple[int, ...]
-    high: tuple[int, ...]
-    lattice: tuple[int, ...]
-    cut: tuple[int, int] | None = None
-    """The axis, and the separator's first plane."""
-
-    @property
-    def sides(self) -> tuple[int, ...]:
-        return tuple(high - low for low, high in zip(self.low, self.high, strict=True))
-
-    def wide(self, reach: int) -> "_Box":
-        """The box with its border."""
-        low = tuple(max(at - reach, 0) for at in self.low)
-        return _Box(low, tuple(min(at + reach, n) for at, n in zip(self.high, self.lattice, strict=True)), self.lattice)
-
-    def halved(self, axis: int, reach: int) -> "_Box":
-        """The box, cut in the middle of an axis by a separator of `reach` planes."""
-        return self._replace(cut=(axis, self.low[axis] + (self.sides[axis] - reach) // 2))
-
-    def part(self, axis: int, low: int, high: int) -> "_Box":
-        """The part between two planes."""
-        first, last = ((*end[:axis], at, *end[axis + 1 :]) for end, at in ((self.low, low), (self.high, high)))
-        return _Box(first, last, self.lattice)
-
-    def eliminated(self, reach: int) -> "_Box":
-        """The separator; the whole box if it is not cut."""
-        return self if self.cut is None else self.part(self.cut[0], self.cut[1], self.cut[1] + reach)
-
-    def parts(self, reach: int) -> tuple["_Box", "_Box"]:
-        """The two subdomains."""
-        assert self.cut is not None
-        axis, at = self.cut
-        return self.part(axis, self.low[axis], at), self.part(axis, at + reach, self.high[axis])
-
-    def numbers(self, numbers: np.ndarray) -> np.ndarray:
-        return numbers[tuple(map(slice, self.low, self.high))].reshape(-1)
+def _count(box: np.ndarray) -> int:
+    return math.prod((box[1] - box[0]).tolist())
 
 
-def _cuts(shape: tuple[int, ...], reach: int) -> list[list[list[_Box]]]:
-    """The boxes from the whole one on, when they are cut never, once, twice and so on."""
-    cuts, above, boxes = [], [], [_Box((0,) * len(shape), shape, shape)]
+def _wide(box: np.ndarray, shape: tuple[int, ...], reach: int) -> np.ndarray:
+    """The box with its border."""
+    return np.clip(np.stack([box[0] - reach, box[1] + reach]), 0, shape)
+
+
+def _cuts(shape: tuple[int, ...], reach: int) -> list[list[list[_Front]]]:
+    """The fronts of each level from the whole box on, when it is cut never, once, twice and so on."""
+    cuts, above, boxes = [], [], [np.array([np.zeros(len(shape), int), shape])]
     while True:
-        cuts.append([*above, boxes])
-        axis = int(np.argmax(boxes[-1].sides))
-        if min(box.sides[axis] for box in boxes) < reach + 2 or math.prod(boxes[-1].sides) <= _SMALLEST:
+        cuts.append([*above, [(box, box) for box in boxes]])
+        sides = np.array([box[1] - box[0] for box in boxes])
+        axis = int(np.argmax(sides[-1]))
+        if sides[:, axis].min() < reach + 2 or math.prod(sides[-1].tolist()) <= _SMALLEST:
             return cuts
-        halved = [box.halved(axis, reach) for box in boxes]
-        above, boxes = [*above, halved], list(itertools.chain(*(box.parts(reach) for box in halved)))
+        level, parts = [], []
+        for box, side in zip(boxes, sides[:, axis], strict=True):
+            separator, below, beyond = box.copy(), box.copy(), box.copy()
+            first = box[0, axis] + (side - reach) // 2
+            separator[:, axis], below[1, axis], beyond[0, axis] = (first, first + reach), first, first + reach
+            level.append((box, separator))
+            parts += [below, beyond]
+        above, boxes = [*above, level], parts
 
 
-def _counts(boxes: list[_Box], reach: int) -> tuple[int, int]:
+def _counts(shape: tuple[int, ...], level: list[_Front], reach: int) -> tuple[int, int]:
     """The most nodes that a front of a level eliminates, and the most of its border."""
-    eliminated = max(math.prod(box.eliminated(reach).sides) for box in boxes)
-    return eliminated, max(math.prod(box.wide(reach).sides) - math.prod(box.sides) for box in boxes)
-
-
-def _entries(cuts: list[list[_Box]], reach: int) -> tuple[int, int]:
-    """How many numbers the factor has with one number a node, and the most that are left between two levels."""
-    sizes = [(len(boxes), *_counts(boxes, reach)) for boxes in cuts]
-    return sum(f * s * (s + b) for f, s, b in sizes), max(f * b * b for f, _, b in sizes)
+    border = max(_count(_wide(box, shape, reach)) - _count(box) for box, _ in level)
+    return max(_count(separator) for _, separator in level), border
 
 
 @functools.lru_cache(maxsize=64)
-def _best(shape: tuple[int, ...], reach: int) -> list[list[_Box]]:
-    return min(_cuts(shape, reach), key=lambda cuts: sum(_entries(cuts, reach)))
+def _best(shape: tuple[int, ...], reach: int) -> tuple[int, list[list[_Front]]]:
+    """How many numbers the smallest factor has with one number a node, and its fronts."""
+
+    def sizes(cuts: list[list[_Front]]) -> tuple[int, int]:
+        """Numbers of the factor, and the most that are left between two levels."""
+        each = [(len(level), *_counts(shape, level, reach)) for level in cuts]
+        return sum(f * s * (s + b) for f, s, b in each), max(f * b * b for f, _, b in each)
+
+    cuts = min(_cuts(shape, reach), key=lambda cuts: sum(sizes(cuts)))
+    return sizes(cuts)[0], cuts
 
 
 @functools.lru_cache(maxsize=64)
 def _levels(shape: tuple[int, ...], reach: int, materials: int) -> tuple[Level, ...]:
     numbers = np.arange(math.prod(shape) * materials).reshape(*shape, materials)
+
+    def inside(box: np.ndarray) -> np.ndarray:
+        return numbers[tuple(map(slice, *box))].reshape(-1)
+
     levels: list[Level] = []
-    for boxes in reversed(_best(shape, reach)):
-        most, widest = (materials * count for count in _counts(boxes, reach))
-        eliminated = np.full((len(boxes), most), numbers.size)
-        border = np.full((len(boxes), widest), numbers.size)
-        for k, box in enumerate(boxes):
-            one = box.eliminated(reach).numbers(numbers)
-            around = np.setdiff1d(box.wide(reach).numbers(numbers), box.numbers(numbers))
+    for level in reversed(_best(shape, reach)[1]):
+        most, widest = (materials * count for count in _counts(shape, level, reach))
+        eliminated = np.full((len(level), most), numbers.size)
+        border = np.full((len(level), widest), numbers.size)
+        for k, (box, separator) in enumerate(level):
+            one, around = inside(separator), np.setdiff1d(inside(_wide(box, shape, reach)), inside(box))
             eliminated[k, : len(one)], border[k, : len(around)] = one, around
         places = None
         if levels:
             both, before = np.concatenate([eliminated, border], axis=1), levels[-1].border
-            places = np.stack(
-                [[_places(row, before[2 * k + part], numbers.size) for part in (0, 1)] for k, row in enumerate(both)]
-            )
+            places = np.full((len(level), 2, both.shape[1]), before.shape[1])
+            for k, part in np.ndindex(places.shape[:2]):
+                among = before[2 * k + part]  # sorted
+                place = np.minimum(np.searchsorted(among, both[k]), len(among) - 1)
+                there = (among[place] == both[k]) & (both[k] < numbers.size)
+                places[k, part, there] = place[there]
         levels.append(Level(eliminated, border, places))
     return tuple(levels)
-
-
-def _places(numbers: np.ndarray, among: np.ndarray, past: int) -> np.ndarray:
-    """Where each number stands in a sorted list; the list's length where it does not, or is past the last."""
-    place = np.minimum(np.searchsorted(among, numbers), len(among) - 1)
-    return np.where((among[place] == numbers) & (numbers < past), place, len(among))

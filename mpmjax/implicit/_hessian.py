@@ -188,9 +188,7 @@ class AnalyticHessian(AbstractHessian):
         require_fields(self)
 
     def at(self, potential: ElasticPotential, u: NodeVector | None) -> TangentAction:
-        def of_law(law: AbstractMaterial, F: Deformation) -> Callable[[Deformation], Deformation]:
-            return law.projected_differential(F) if self.projected else law.stress_differential(F)
-
+        of_law = lambda law, F: law.projected_differential(F) if self.projected else law.stress_differential(F)  # noqa: E731
         pairs = zip(potential.material_points, potential.deformation(u), strict=True)
         tangents = tuple(points.stress_differential(F, of_law, definite=self.projected) for points, F in pairs)
         return TangentAction(potential, tangents, self.projected, u)

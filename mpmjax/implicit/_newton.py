@@ -178,19 +178,11 @@ def backtrack(
     slack: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """The first step size a of 1, ½, ¼, ... with sufficient decrease, E(a) ≤ E(0) + 10⁻⁴ a E'(0) + slack (L. Armijo,
-    Pacific J. Math. 16 (1966) 1, doi 10.2140/pjm.1966.16.1).
+    Pacific J. Math. 16 (1966) 1, doi 10.2140/pjm.1966.16.1), and the number of halvings, with E = `merit` [J],
+    E(0) = `start` and E'(0) = `slope` < 0. At `MOST_HALVINGS` the search has failed.
 
     The slack is the rounding of E. Near a minimum the expected decrease is smaller than it, and without slack a good
     step would be refused. NaN is no decrease, so a step that leaves the domain of E is halved.
-
-    Args:
-        merit: the function E of the step size [J].
-        start: E(0).
-        slope: E'(0), negative.
-        slack: by how much E may miss the decrease [J].
-
-    Returns:
-        The step size, and the number of halvings. At `MOST_HALVINGS` the search has failed.
     """
 
     def refused(trial: tuple[Array, Array]) -> Bool[Array, ""]:

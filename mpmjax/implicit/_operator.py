@@ -86,13 +86,8 @@ class ImplicitOperator(eqx.Module):
         return combine(self.unconstrained(combine(vector, 0)), self.projection.identity_rows(vector, self.mass))
 
     def product(self, u: Float[Array, "m"], weight: Float[Array, "m"], active: Bool[Array, "k"]) -> Sequence[Array]:
-        """W⁻¹A u and uᵀA u of flat vectors, as an iteration needs them.
-
-        Args:
-            u: u, shape (m,).
-            weight: the diagonal of W, shape (m,).
-            active: `active_blocks`. Elsewhere u is zero and nothing is free.
-        """
+        """W⁻¹A u and uᵀA u of a flat vector, with the diagonal of W. Outside of the active blocks u is zero and nothing
+        is free."""
         v, free = u.reshape(self.projection.free.shape), self.projection.free.reshape(-1)
         if self.projection.normals or self.viscosity is not None:
             image = self.mv(v).reshape(-1)

@@ -93,7 +93,7 @@ class ElasticPotential(eqx.Module):
     @property
     def viscous(self) -> bool:
         """Whether any of the materials has viscosity, or any of the terms a resistance."""
-        return self.material_viscous or any(term.viscous for term in self.terms)
+        return any(part.viscosity is not None for part in self.material_points) or any(t.viscous for t in self.terms)
 
     @property
     def material_viscous(self) -> bool:

@@ -1,5 +1,6 @@
 """The interface of linear solvers, and the report of a solve."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -9,27 +10,29 @@ import lineax as lx
 from mpmjax._types import Array, Bool, Float, Int
 from mpmjax.checks import require_that
 
+_COUNT = partial(jnp.zeros, (), jnp.int32)
+
 
 class SolveInfo(eqx.Module):
-    """Cost and quality of the solution of one step's equations."""
+    """Cost and quality of the solution of one step's equations. The defaults are those of an update without a solve."""
 
-    iterations: Int[Array, "*f"]
+    iterations: Int[Array, "*f"] = eqx.field(default_factory=_COUNT)
     """Iterations of the linear solver, summed over Newton steps; 0 if the solver states none."""
-    newton: Int[Array, "*f"]
+    newton: Int[Array, "*f"] = eqx.field(default_factory=_COUNT)
     """Newton steps."""
-    line_search: Int[Array, "*f"]
+    line_search: Int[Array, "*f"] = eqx.field(default_factory=_COUNT)
     """Halvings of a Newton step by the line search."""
-    residual: Float[Array, "*f"]
+    residual: Float[Array, "*f"] = eqx.field(kw_only=True)
     """True relative residual at the end. For one linear solve it is in the norm of the inverse preconditioner; for
     Newton's method in that of the inverse mass, and relative to the momentum of the balanced forces if their sum
     vanishes."""
-    converged: Bool[Array, "*f"]
+    converged: Bool[Array, "*f"] = eqx.field(default_factory=partial(jnp.ones, (), bool))
     """Whether the residual is within the solver's tolerance, or at the limit of the precision."""
-    nearly_converged: Bool[Array, "*f"]
+    nearly_converged: Bool[Array, "*f"] = eqx.field(default_factory=partial(jnp.zeros, (), bool))
     """Whether it is not, but within ten times the tolerance."""
-    indefinite: Bool[Array, "*f"]
+    indefinite: Bool[Array, "*f"] = eqx.field(default_factory=partial(jnp.zeros, (), bool))
     """Whether the solver met a direction of negative curvature. M + χH is then indefinite, and may be near singular."""
-    report: Float[Array, "*f"]
+    report: Float[Array, "*f"] = eqx.field(kw_only=True)
     """Zero. Its tangent is the relative residual of the tangent solves that did not converge (see `Reporting`)."""
 
     def followed_by(self, later: "SolveInfo") -> "SolveInfo":
@@ -56,8 +59,7 @@ class SolveInfo(eqx.Module):
 
 def no_solve(dtype: Any) -> SolveInfo:
     """The report of an update without a solve."""
-    count, zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), dtype), jnp.zeros((), bool)
-    return SolveInfo(count, count, count, residual=zero, converged=~no, nearly_converged=no, indefinite=no, report=zero)
+    return SolveInfo(residual=jnp.zeros((), dtype), report=jnp.zeros((), dtype))
 
 
 class AbstractInnerProductSolver(lx.AbstractLinearSolver[Any]):

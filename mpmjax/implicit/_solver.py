@@ -141,10 +141,9 @@ class Space(NamedTuple):
 def diagonal(product: Callable[[Array], Sequence[Array]], weight: Array, active: Bool[Array, "k"]) -> Space:
     """Vectors with a diagonal W, zero outside of the active blocks, which are skipped."""
 
-    def combine(a: Array, b: Array, c: Array, d: Array, s: Array, t: Array, onto: int) -> Sequence[Array]:
-        return combine_onto[onto](a, b, c, d, jnp.stack([s, t]), weight, active)
-
-    return Space(product, lambda a, c: (weight * a * c).sum(), combine)
+    dot = lambda a, c: (weight * a * c).sum()  # noqa: E731
+    combine = lambda a, b, c, d, s, t, onto: combine_onto[onto](a, b, c, d, jnp.stack([s, t]), weight, active)  # noqa: E731
+    return Space(product, dot, combine)
 
 
 def paired(multiply: Callable[[Array], Array], solve: Callable[[Array], Array]) -> Space:
@@ -155,11 +154,7 @@ def paired(multiply: Callable[[Array], Array], solve: Callable[[Array], Array]) 
         image = multiply(u[0])
         return jnp.stack([solve(image), image]), (u[0] * image).sum()
 
-    def combine(a: Array, b: Array, c: Array, d: Array, s: Array, t: Array, onto: int) -> list[Array]:
-        del onto
-        return [a + s * b, z := c + t * d, dot(z, z)]
-
-    return Space(product, dot, combine)
+    return Space(product, dot, lambda a, b, c, d, s, t, onto: [a + s * b, z := c + t * d, dot(z, z)])
 
 
 class Iterate(NamedTuple):
@@ -333,20 +328,23 @@ def solve_linear(
         rhs: b.
         inner: the inner product of W.
         guess: where an iterative solver starts. Default: zero.
-        rtol: the relative tolerance of a solver that takes an inner product and has none of its own. Default: that of
-            the precision.
+        rtol: the relative tolerance of a solver that takes an inner product and has none. Default: the precision's.
 
     Raises:
         ValueError: the solver refuses the operator, or returns no vector.
     """
-    none = jnp.zeros((), jnp.int32)
     if isinstance(solver, AbstractInnerProductSolver):
-        every = {"inner_product": inner, "y0": guess, "rtol": rtol}
-        options = {name: value for name, value in every.items() if value is not None}
+        options = {"inner_product": inner} | {k: v for k, v in (("y0", guess), ("rtol", rtol)) if v is not None}
         state: Any = solver.init(operator, options)  # pyright: ignore[reportArgumentType]
         x, result, stats = solver.compute(state, rhs, options)
-        quality = result == lx.RESULTS.successful, stats["nearly_converged"], stats["indefinite"]
-        info = SolveInfo(stats["num_steps"], none, none, stats["residual"], *quality, jnp.zeros_like(stats["residual"]))
+        info = SolveInfo(
+            stats["num_steps"],
+            residual=stats["residual"],
+            converged=result == lx.RESULTS.successful,
+            nearly_converged=stats["nearly_converged"],
+            indefinite=stats["indefinite"],
+            report=jnp.zeros_like(stats["residual"]),
+        )
         return x, info, stats["spectral_radius"]
 
     name, inner, stiffness = type(solver).__name__, inner.factored(), operator.hessian
@@ -356,11 +354,9 @@ def solve_linear(
     size = jnp.where(size == 0, 1, size)
     b = b / size
     options = {} if guess is None else {"y0": inner.solve_factor(inner.apply(guess)) / size}
-    scaled = lx.FunctionLinearOperator(
-        lambda y: inner.solve_factor(operator.mv(inner.solve_factor_transpose(y))),
-        operator.in_structure(),
-        (lx.symmetric_tag, lx.positive_semidefinite_tag) if definite else lx.symmetric_tag,
-    )
+    multiply = lambda y: inner.solve_factor(operator.mv(inner.solve_factor_transpose(y)))  # noqa: E731
+    tags = (lx.symmetric_tag, lx.positive_semidefinite_tag) if definite else lx.symmetric_tag
+    scaled = lx.FunctionLinearOperator(multiply, operator.in_structure(), tags)
     try:
         state = solver.init(scaled, options)
     except ValueError as error:
@@ -387,8 +383,12 @@ def solve_linear(
     if relative is not None or atol is not None:  # atol is of each component of a right-hand side of norm one
         tolerance = (0 if relative is None else relative) + math.sqrt(b.size) * (0 if atol is None else atol)
     converged = (result == lx.RESULTS.successful) & (residual <= tolerance)
-    nearly = ~converged & (residual <= NEARLY_CONVERGED * tolerance)
-    iterations = jnp.asarray(stats.get("num_steps", 0), dtype=jnp.int32)
-    quality = converged, nearly, (y * image).sum() < 0
-    info = SolveInfo(iterations, none, none, residual, *quality, report=jnp.zeros_like(residual))
+    info = SolveInfo(
+        jnp.asarray(stats.get("num_steps", 0), dtype=jnp.int32),
+        residual=residual,
+        converged=converged,
+        nearly_converged=~converged & (residual <= NEARLY_CONVERGED * tolerance),
+        indefinite=(y * image).sum() < 0,
+        report=jnp.zeros_like(residual),
+    )
     return size * inner.solve_factor_transpose(y), info, jnp.ones_like(residual)

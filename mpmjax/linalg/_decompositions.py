@@ -176,7 +176,10 @@ def _rotation_3d(F: Matrix) -> Matrix:
         R = _rotation_of(q)
         x, y, z = _spin(R, spin_compliance(matmul(transpose(R), F)), F)
         near = x * x + y * y + z * z < 0.1  # not where R is hardly determined
-        q = _normalised([a + jnp.where(near, b / 2, 0) for a, b in zip(q, _times_spin(q, (x, y, z)), strict=True)])
+        a, b, c, d = q
+        # the quaternion product of q with (0, ω)
+        turned = [-b * x - c * y - d * z, a * x + c * z - d * y, a * y + d * x - b * z, a * z + b * y - c * x]
+        q = _normalised([old + jnp.where(near, new / 2, 0) for old, new in zip(q, turned, strict=True)])
     return _rotation_of(q)
 
 
@@ -222,12 +225,6 @@ def _normalised(q: list[Array]) -> list[Array]:
     nothing = size == 0
     w, *rest = (a / jnp.where(nothing, 1, size) for a in q)
     return [jnp.where(nothing, 1, w), *rest]
-
-
-def _times_spin(q: list[Array], spin: tuple[Array, Array, Array]) -> list[Array]:
-    """The quaternion product of q with (0, spin)."""
-    (w, x, y, z), (a, b, c) = q, spin
-    return [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
 
 
 def _rotation_of(q: list[Array]) -> Matrix:

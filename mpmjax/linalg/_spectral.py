@@ -146,8 +146,12 @@ def _differential(f: AbstractSpectral, S: Matrix, frame: Frame, directions: tupl
         return matmul(V * f.of(s), transpose(V))
     if order == 1:
         return _from_frame(V, f.slope(s[:, None], s[None]) * _in_frame(V, directions[0]))
-    s, V = _ascending(s, V)
-    products = []
+    values, columns, products = list(jnp.unstack(s)), list(jnp.unstack(V, axis=1)), []  # in ascending order
+    for i in [i for last in range(len(values) - 1, 0, -1) for i in range(last)]:
+        swap = values[i] > values[i + 1]
+        for a in (values, columns):
+            a[i], a[i + 1] = jnp.where(swap, a[i + 1], a[i]), jnp.where(swap, a[i], a[i + 1])
+    s, V = jnp.stack(values), jnp.stack(columns, axis=1)
     for arranged in itertools.permutations([_in_frame(V, A) for A in directions]):
         factors = (jnp.expand_dims(A, [*range(k), *range(k + 2, order + 1)]) for k, A in enumerate(arranged))
         products.append(reduce(jnp.multiply, factors))
@@ -176,16 +180,6 @@ def _differential_transpose(cotangent: Matrix, args: Any) -> Any:
     pulled = _differential(f, S, frame, tuple(others))
     nothing = jax.tree.map(lambda _: None, (f, S, frame))
     return *nothing, tuple(pulled if want else None for want in wanted)
-
-
-def _ascending(s: Array, V: Matrix) -> Frame:
-    """The frame with its eigenvalues in ascending order."""
-    values, columns = list(jnp.unstack(s)), list(jnp.unstack(V, axis=1))
-    for i in [i for last in range(len(values) - 1, 0, -1) for i in range(last)]:
-        swap = values[i] > values[i + 1]
-        for a in (values, columns):
-            a[i], a[i + 1] = jnp.where(swap, a[i + 1], a[i]), jnp.where(swap, a[i], a[i + 1])
-    return jnp.stack(values), jnp.stack(columns, axis=1)
 
 
 def _divided_differences(f: AbstractSpectral, s: Array, order: int) -> Array:

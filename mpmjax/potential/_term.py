@@ -20,14 +20,13 @@ class Displacement:
     def __init__(self, stencil: Stencil, size: int, nodes: NodeVector | None = None):
         """A field of n = `size` nodes, (n, d); None for zero, which spares the gather."""
         self.stencil, self.size, self.at_rest = stencil, size, nodes is None
-        self._nodes = nodes
+        if nodes is not None:
+            self.nodes = nodes
 
     @cached_property
     def nodes(self) -> NodeVector:
         """u_i, shape (n, d)."""
-        if self._nodes is None:
-            return jnp.zeros((self.size, self.stencil.dim), self.stencil.offset.dtype)
-        return self._nodes
+        return jnp.zeros((self.size, self.stencil.dim), self.stencil.offset.dtype)
 
     @cached_property
     def at_particles(self) -> tuple[Float[Array, "d p"], Float[Array, "d d p"]]:
@@ -196,10 +195,6 @@ class AbstractSpring(AbstractTerm, AbstractStiffness):
     def spread(self, amount: Array, size: int) -> Forces:
         """Nᵀ a."""
 
-    @abc.abstractmethod
-    def spread_square(self, amount: Array, size: int) -> Forces:
-        """Σ_s N_si² a_s, approximately (see `diagonal`)."""
-
     def stretched(self, moved: Displacement) -> Array:
         """e + N u [m]."""
         return self.stretch if moved.at_rest else self.stretch + self.elongation(moved)
@@ -219,7 +214,3 @@ class AbstractSpring(AbstractTerm, AbstractStiffness):
 
     def is_positive_semidefinite(self) -> bool:
         return True
-
-    def diagonal(self, stencil: Stencil, size: int) -> Forces:
-        del stencil
-        return self.spread_square(self.stiffness, size)

@@ -175,8 +175,9 @@ class Support(AbstractSpring):
     def spread(self, amount: Float[Array, "d s"], size: int) -> Forces:
         return Forces(nodes=self.points.nodal(amount, size))
 
-    def spread_square(self, amount: Float[Array, "d s"], size: int) -> Forces:
-        return Forces(nodes=self.points.diagonal(amount, size))
+    def diagonal(self, stencil: Stencil, size: int) -> Forces:
+        del stencil
+        return Forces(nodes=self.points.diagonal(self.stiffness, size))
 
     @property
     def viscous(self) -> bool:

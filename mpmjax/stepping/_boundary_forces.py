@@ -12,12 +12,12 @@ from mpmjax.boundary import (
     received_impulses,
     taken_by_mirrors,
 )
-from mpmjax.discretisation import AbstractTransfer, Gathered, Stencil
+from mpmjax.discretisation import Gathered
 from mpmjax.geometry import moment
 from mpmjax.material import Freedom
 from mpmjax.potential import Image, RigidImage
 from mpmjax.state import Particles, Scene
-from mpmjax.stepping._grid_update import GridUpdate, elastic_impulse, reaction
+from mpmjax.stepping._grid_update import GridUpdate, reaction
 from mpmjax.stepping._integrator import AbstractIntegrator
 from mpmjax.stepping._nodes import Nodes, places_of
 
@@ -50,12 +50,12 @@ def impulse_on_boundaries(
 ) -> Impulses:
     """The impulse on each boundary of the scene, and on what guides its rigid bodies, in the step from t, from the
     nodes at its start, before and after the fold at symmetry planes, and their update."""
-    held, force_at, stencil = new.held(nodes), method.force_at(), nodes.potential.stencil
+    held, force_at = new.held(nodes), method.force_at()
     solved, carrier = new.solved.velocity, new.motion.carrier
     whole, elastic = new.solved, new.elastic
     if nodes.mirror.images:  # of all nodes
         whole = jax.tree.map(nodes.mirror.unfold, whole)
-        elastic = elastic_impulse(unfolded, method, whole)
+        elastic = None if unfolded.f is None else method.elastic_impulse(unfolded, whole)
     residual = reaction(unfolded, whole, elastic)
     grid, window, dt = scene.grid, scene.window(particles), nodes.dt
     each = enumerate(scene.boundary)
@@ -87,7 +87,10 @@ def impulse_on_boundaries(
 
     # what symmetry planes take of the impulses on all nodes, and what reaches the folded ones
     if scene.transfer.needs_change:
-        kept = _share_of_change(scene.transfer, scene.grid.dim, residual.dtype)
+        # the share with which particles take the change of the nodes' velocity and not the velocity itself, (1, d)
+        zero, slope = jnp.zeros((grid.dim, 1), residual.dtype), jnp.zeros((grid.dim, grid.dim, 1), residual.dtype)
+        none, whole_change = Gathered(zero, slope, slope), Gathered(zero + 1, slope, slope)
+        kept = (scene.transfer.velocity(zero, none, whole_change) - scene.transfer.velocity(zero, none, none)).T
         mass = jnp.where(soft, unfolded.mass, 0) if couples else unfolded.mass  # a rigid body takes the velocity
         residual = residual + kept * mass[:, None] * (unfolded.velocity - unfold(new.before(nodes)))
     of_planes, residual = taken_by_mirrors(residual, images)
@@ -118,9 +121,14 @@ def impulse_on_boundaries(
         if number is not None:
             parts.append(OwnedImpulse(friction, number))
 
-    places, pivots = at, _pivots(scene, t, residual)
-    if scene.total:
-        places = _moved_places(scene, particles, stencil, unfolded, owners, at, t)
+    places, pivots, colliders = at, _pivots(scene, t, residual), unfolded.conditions.colliders
+    if scene.total:  # where the body has moved the nodes of the reference configuration
+        places = jnp.where(unfolded.occupied, places_of(particles, unfolded.potential.stencil, grid.size), places)
+        for number, boundary in enumerate(scene.boundary):
+            carried = boundary.carried(at, t)
+            if carried is not None:
+                places = jnp.where((owners == number).all(axis=1, keepdims=True), carried, places)
+        places = places if colliders is None else jnp.where(colliders.touched[:, None], colliders.position, places)
     if force_at is not None:
         carried = unfold(carrier)
         for image in nodes.mirror.rigid:  # to where its centre goes; its couple is about that
@@ -162,35 +170,6 @@ def _spread(
         first = jnp.where(jnp.asarray(freedom.directions), first, guide)
     first, of_spin = (jnp.where(number == nobody, -1, number) for number in (first, of_spin))
     return image.with_own(owners, jnp.broadcast_to(first, layer.shape)), of_spin
-
-
-def _share_of_change(transfer: AbstractTransfer, dim: int, dtype: jnp.dtype) -> Array:
-    """The share with which particles take the change of the nodes' velocity and not the velocity itself, (1, d)."""
-    zero, one = jnp.zeros((dim, 1), dtype), jnp.ones((dim, 1), dtype)
-    slope = jnp.zeros((dim, dim, 1), dtype)
-    none, all_of_it = (Gathered(value, slope, slope) for value in (zero, one))
-    return (transfer.velocity(zero, none, all_of_it) - transfer.velocity(zero, none, none)).T
-
-
-def _moved_places(
-    scene: Scene,
-    particles: Particles,
-    stencil: Stencil,
-    nodes: Nodes,
-    owners: Int[Array, "n d"],
-    reference: NodeVector,
-    t: Scalar,
-) -> NodeVector:
-    """Where the body has moved the nodes of the reference configuration at time t [m], shape (n, d)."""
-    colliders, places = nodes.conditions.colliders, reference
-    places = jnp.where(nodes.occupied, places_of(particles, stencil, scene.grid.size), places)
-    for number, boundary in enumerate(scene.boundary):
-        carried = boundary.carried(reference, t)
-        if carried is not None:
-            places = jnp.where((owners == number).all(axis=1, keepdims=True), carried, places)
-    if colliders is None:
-        return places
-    return jnp.where(colliders.touched[:, None], colliders.position, places)
 
 
 def _pivots(scene: Scene, t: Scalar, like: NodeVector) -> Array:

@@ -60,7 +60,27 @@ def contacts_of_bodies(
     force_at: Scalar | None,
 ) -> list[BodyContact]:
     """The contacts of each two bodies of a scene with `bodies`, which go on beyond symmetry planes (see `faces_of`)."""
-    bodies = _bodies(scene, particles, potential, images)
+    # the bodies, one for each layer of nodes
+    materials, stencil = potential.material_points, potential.stencil
+    d, dx, layers = particles.dim, jnp.asarray(scene.grid.spacing), scene.grid.layers
+    volume = jnp.concatenate([points.volume * jnp.abs(points.volume_ratio()) for points in materials])
+    means = jnp.stack([contact_moduli(scene, particles, materials), particles.mass / volume, volume ** (1 / d) / dx])
+    part = volume / dx**d
+    values = part * jnp.concatenate([jnp.ones_like(part)[None], means, components(particles.v)])
+    sums = scatter(stencil, values, None, scene.grid.size)
+    # w (x_p − x_i)_a = −D_a g_a, with g the moving-least-squares gradient
+    arms = -jnp.eye(d, dtype=part.dtype)[..., None] * (part * stencil.moment / dx)
+    middle = images.fold(scatter(stencil.least_squares, None, arms, scene.grid.size)).T
+    scalars = images.fold_scalars(sums[:, :4]).T
+    velocity = images.fold(sums[:, 4:]).T
+
+    full = jnp.where(scalars[0] > 0, scalars[0], 1)
+    each = jnp.concatenate([scalars[:1], scalars[1:] / full, velocity / full, middle / full])
+    each = each.reshape(len(each), layers, -1).swapaxes(0, 1)
+    bodies = [
+        Body(part=a[0], modulus=a[1], density=a[2], side=a[3], velocity=a[4 : 4 + d], middle=a[4 + d :]) for a in each
+    ]
+
     at = jnp.ones(()) if force_at is None else jnp.asarray(force_at)
     return [
         body_contact(
@@ -82,26 +102,3 @@ def contact_moduli(scene: Scene, particles: Particles, materials: tuple[Material
     """The modulus of contact [Pa] of each prepared particle, shape (p,) (see `AbstractLaw.contact_modulus`)."""
     each = zip(scene.laws, materials, particles.histories, strict=True)
     return jnp.concatenate([law.contact_modulus(points.deformation, history) for law, points, history in each])
-
-
-def _bodies(scene: Scene, particles: Particles, potential: ElasticPotential, images: Mirror) -> list[Body]:
-    """The bodies, one for each layer of nodes."""
-    materials, stencil = potential.material_points, potential.stencil
-    d, dx, layers = particles.dim, jnp.asarray(scene.grid.spacing), scene.grid.layers
-    volume = jnp.concatenate([points.volume * jnp.abs(points.volume_ratio()) for points in materials])
-    means = jnp.stack([contact_moduli(scene, particles, materials), particles.mass / volume, volume ** (1 / d) / dx])
-    part = volume / dx**d
-    values = part * jnp.concatenate([jnp.ones_like(part)[None], means, components(particles.v)])
-    sums = scatter(stencil, values, None, scene.grid.size)
-    # w (x_p − x_i)_a = −D_a g_a, with g the moving-least-squares gradient
-    arms = -jnp.eye(d, dtype=part.dtype)[..., None] * (part * stencil.moment / dx)
-    middle = images.fold(scatter(stencil.least_squares, None, arms, scene.grid.size)).T
-    scalars = images.fold_scalars(sums[:, :4]).T
-    velocity = images.fold(sums[:, 4:]).T
-
-    full = jnp.where(scalars[0] > 0, scalars[0], 1)
-    each = jnp.concatenate([scalars[:1], scalars[1:] / full, velocity / full, middle / full])
-    each = each.reshape(len(each), layers, -1).swapaxes(0, 1)
-    return [
-        Body(part=a[0], modulus=a[1], density=a[2], side=a[3], velocity=a[4 : 4 + d], middle=a[4 + d :]) for a in each
-    ]

@@ -11,7 +11,7 @@ from mpmjax.autodiff import saved_for_backward, without_derivative
 from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, count_places, find_active_set
 from mpmjax.implicit import SolveInfo, no_solve
 from mpmjax.stepping._implicit_integrators import AbstractImplicitIntegrator
-from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion, advance
+from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
 
 
@@ -78,7 +78,7 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     def solve(
         held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
     ) -> tuple[ConstrainedNodes, NodeMotion, NodeMotion, SolveInfo]:
-        motion, info = advance(replace(held.nodes, friction=StageFriction(held)), method, guess)
+        motion, info = method.advance(replace(held.nodes, friction=StageFriction(held)), guess)
         motion = solved = jax.tree.map(held.images.unfold, motion)
         if motion.friction is not None:
             solved = replace(motion, velocity=motion.velocity - motion.friction)
@@ -88,7 +88,8 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 
     def attempt(held: ConstrainedNodes, guess: NodeVector) -> tuple:
         held, motion, solved, info = solve(held, frozen_method, guess)
-        missing = reaction(frozen, solved, elastic_impulse(frozen, frozen_method, motion))
+        elastic = None if frozen.f is None else frozen_method.elastic_impulse(frozen, motion)
+        missing = reaction(frozen, solved, elastic)
         return held, motion.velocity, held.without_spring_impulses(missing), motion.carrier, info
 
     start = frozen_method.mean_displacement(frozen, NodeMotion(guess))
@@ -96,17 +97,12 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         find_active_set(frozen, guess, start, attempt, no_solve(guess.dtype), explicit=method.is_explicit)
     )
     held, motion, solved, info = solve(constrain(nodes, active), method, guess)
-    elastic = elastic_impulse(nodes, method, motion)
+    elastic = None if nodes.f is None else method.elastic_impulse(nodes, motion)
     holding = held.without_spring_impulses(reaction(nodes, solved, elastic))
     velocity, friction = held.friction(solved.velocity, holding)
     contact = ContactInfo(sweeps, count_places(nodes, *held.violations(solved.velocity, holding)))
     motion = method.with_friction(motion, velocity - motion.velocity)
     return GridUpdate(motion, solved, elastic, cost.followed_by(info), held, friction, contact)
-
-
-def elastic_impulse(nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion) -> NodeVector | None:
-    """The method's impulse of elastic forces [kg m/s], shape (n, d); None if P2G summed momentum and force together."""
-    return None if nodes.f is None else method.elastic_impulse(nodes, motion)
 
 
 def reaction(nodes: Nodes, motion: NodeMotion, elastic: NodeVector | None) -> NodeVector:

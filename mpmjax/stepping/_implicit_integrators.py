@@ -107,7 +107,7 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             potential=nodes.potential,
             hessian=self.hessian,
             projection=nodes.projection,
-            prescribed=nodes.prescribed if nodes.conditions.moves or nodes.potential.mirror.moving else None,
+            prescribed=nodes.prescribed if nodes.conditions.moves else None,
             preconditioner=self.preconditioner,
             theta=theta,
             action=action,
@@ -127,18 +127,17 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         stages = self.stages(nodes, motion) if stages is None else stages
         if not self.linearises:
             return self.exact_impulse(nodes, motion, stages)
-        stiffness, mean = self.hessian.at(nodes.potential, None), self.mean_displacement(nodes, motion, stages)
-        return nodes.dt * (sum(q for q, _ in stages) * nodes.force - stiffness(mean))
+        mean = reduce(jnp.add, (q * u for q, u in stages if u is not None))
+        return nodes.dt * (sum(q for q, _ in stages) * nodes.force - self.hessian.at(nodes.potential, None)(mean))
 
     def exact_impulse(self, nodes: Nodes, motion: NodeMotion, stages: Stages | None = None) -> NodeVector:
         stages = self.stages(nodes, motion) if stages is None else stages
         forces = (q * (nodes.force if u is None else nodes.potential.force(u)) for q, u in stages)
         return nodes.dt * reduce(jnp.add, forces)
 
-    def mean_displacement(self, nodes: Nodes, motion: NodeMotion, stages: Stages | None = None) -> NodeVector:
-        """Σ q u [m] of the motion's stages or of others."""
-        stages = self.stages(nodes, motion) if stages is None else stages
-        return reduce(jnp.add, (q * u for q, u in stages if u is not None))
+    def mean_displacement(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Σ q u [m] of the motion's stages."""
+        return reduce(jnp.add, (q * u for q, u in self.stages(nodes, motion) if u is not None))
 
     def stability_factor(self) -> Scalar:
         return 0.0
@@ -204,11 +203,9 @@ class SemiImplicit(AbstractImplicitIntegrator):
         return NodeMotion(v, resisted=(1 - beta) * v0 + beta * v if viscous else None), info
 
     def stages(self, nodes: Nodes, motion: NodeMotion) -> Stages:
-        """One, at βΔt v^{n+1}."""
         return ((1, self.beta * nodes.dt * motion.velocity),)
 
     def force_at(self) -> Scalar:
-        """β."""
         return self.beta
 
     def stability_factor(self) -> Scalar:
@@ -241,7 +238,6 @@ class BackwardEuler(AbstractImplicitIntegrator):
         return NodeMotion(v, resisted=v if nodes.potential.viscous else None), info
 
     def stages(self, nodes: Nodes, motion: NodeMotion) -> Stages:
-        """One, at Δt v^{n+1}."""
         return ((1, nodes.dt * motion.velocity),)
 
 
@@ -278,11 +274,9 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
         return NodeMotion(2 * mean - v0, mean, resisted=mean if nodes.potential.viscous else None), info
 
     def stages(self, nodes: Nodes, motion: NodeMotion) -> Stages:
-        """One, at ½Δt v̄."""
         return ((1, nodes.dt / 2 * motion.carrier),)
 
     def force_at(self) -> Scalar:
-        """½."""
         return 0.5
 
 
@@ -351,11 +345,9 @@ class TRBDF2(AbstractImplicitIntegrator):
         return replace(motion, velocity=motion.velocity + change, mean=mean)
 
     def stages(self, nodes: Nodes, motion: NodeMotion) -> Stages:
-        """Stages at 0, γΔt and Δt."""
         _, q0, q1, q2 = self.weights()
         inner = motion.carrier if motion.inner is None else motion.inner
         return (q0, None), (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
 
     def force_at(self) -> Scalar:
-        """½."""
         return 0.5

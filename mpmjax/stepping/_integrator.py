@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import NodeVector, Scalar
-from mpmjax.implicit import SolveInfo, no_solve
+from mpmjax.implicit import SolveInfo
 from mpmjax.stepping._nodes import Nodes
 
 
@@ -125,17 +125,6 @@ class AbstractIntegrator(eqx.Module):
         return ()
 
 
-def advance(nodes: Nodes, method: AbstractIntegrator, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
-    """`AbstractIntegrator.advance`, with a check that an integrator which claims to treat viscosity does so."""
-    motion, info = method.advance(nodes, guess)
-    if not method.explicit_viscosity and motion.resisted is None and nodes.potential.viscous:
-        raise ValueError(
-            f"{type(method).__name__} has explicit_viscosity = False, so its advance must return the velocity that "
-            "viscosity resists, NodeMotion.resisted. It returned None."
-        )
-    return motion, info
-
-
 class Explicit(AbstractIntegrator):
     """Symplectic Euler: v^{n+1} = v* = v^n + Δt (g + f/m) (derivation, eq. 4). Positions move with v^{n+1}.
 
@@ -154,7 +143,8 @@ class Explicit(AbstractIntegrator):
         v = nodes.explicit_velocity()
         if nodes.conditions.holds:
             v = nodes.projection.combine(v, nodes.prescribed)
-        return NodeMotion(v), no_solve(v.dtype)
+        zero = jnp.zeros((), v.dtype)
+        return NodeMotion(v), SolveInfo(residual=zero, report=zero)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(0) [kg m/s], on nodes that have mass."""

@@ -35,8 +35,8 @@ class Nodes(AbstractNodes):
     """`velocity`; where P2G has summed momentum and force together, v*."""
     f: NodeVector | None
     """`force`; None where P2G has summed momentum and force together."""
-    g: Array | None
-    """`acceleration`; None likewise."""
+    g: Any
+    """`acceleration`, an array; None likewise."""
     dt: Float[Array, ""]
     """Δt [s]."""
     spacing: Float[Array, ""]
@@ -70,13 +70,12 @@ class Nodes(AbstractNodes):
 
     @property
     def force(self) -> NodeVector:
-        """Internal force at the start of the step [N], shape (n, d): the elastic one, and for integrators with explicit
-        viscosity the viscous one."""
+        """Internal force at the start of the step [N], shape (n, d), with that of explicit viscosity."""
         return self._apart(self.f)
 
     @property
     def acceleration(self) -> Array:
-        """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
+        """Body acceleration g [m/s²], shape (d,) or (n, d)."""
         return self._apart(self.g)
 
     def _apart(self, field: Any) -> Any:
@@ -105,20 +104,23 @@ class Nodes(AbstractNodes):
     @property
     def projection(self) -> Projection:
         """The projection on the components of velocity that nothing holds."""
+        if self.conditions.colliders is None:
+            return Projection(self.free)
         return Projection(self.free, tuple(part.direction for part in self.free_normals))
 
     @property
     def prescribed(self) -> NodeVector:
         """The velocity of held components [m/s], shape (n, d)."""
-        parts, velocity = self.free_normals, self.potential.mirror.with_motion(self.conditions.velocity)
-        if not parts:
+        velocity, images = self.conditions.velocity, self.potential.mirror
+        velocity = images.with_motion(velocity) if images.images else velocity
+        if self.conditions.colliders is None or not (parts := self.free_normals):
             return velocity
         along = reduce(jnp.add, (part.direction * part.speed[:, None] for part in parts))
         return jnp.where(self.free, along, velocity)
 
     def inertial_velocity(self) -> NodeVector:
         """v^n + Δt g [m/s], shape (n, d)."""
-        return jnp.where(self.occupied, self.velocity + self.dt * self.acceleration, 0)
+        return jnp.where(self.occupied, self.velocity + self.dt * self.g, 0)
 
     def explicit_velocity(self) -> NodeVector:
         """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
@@ -145,13 +147,10 @@ class Nodes(AbstractNodes):
         return replace(self, g=self.g + self.per_mass(force))
 
     def folded(self, images: Mirror) -> "Nodes":
-        """The nodes with the sums of their images at mirror planes added; the same nodes without a plane.
-
-        A force is folded as the momentum that it makes is.
-        """
-        if not images.images:
-            return self
-        folded = replace(self, mass=images.fold_scalar(self.mass))
+        """The nodes with the sums of their images at mirror planes added. A force is folded as the momentum that it
+        makes is."""
+        conditions = replace(self.conditions, moves=self.conditions.moves or bool(images.moving))
+        folded = replace(self, mass=images.fold_scalar(self.mass), conditions=conditions)
 
         def fold(field: Array) -> NodeVector:
             """Fold a field per mass."""
@@ -167,7 +166,8 @@ class Nodes(AbstractNodes):
 
     def constrained(self, images: Mirror, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "Nodes":
         """The nodes folded at these mirrors, with the components `fixed` held, and the force of further terms."""
-        nodes = replace(self.folded(images), conditions=replace(self.conditions, fixed=fixed, holds=True))
+        nodes = self.folded(images) if images.images else self
+        nodes = replace(nodes, conditions=replace(self.conditions, fixed=fixed, holds=True))
         if not terms:
             return nodes
         potential = replace(nodes.potential, terms=nodes.potential.terms + terms)
@@ -219,27 +219,19 @@ def particles_to_grid(
         potential=potential,
         conditions=Conditions(jnp.zeros(v.shape, bool), jnp.zeros_like(v), holds=False, moves=False),
     )
-    if scene.loads:
-        nodes = _with_loads(scene, particles, nodes, t, body_force_at, explicit_viscosity=explicit_viscosity)
+    if scene.loads:  # forces at points of the body, and the terms of springs and dashpots
+        points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
+        potential = replace(potential, terms=terms_of(scene.loads, points, t + body_force_at * nodes.dt))
+        forces = [term.force(potential.displaced(None)) for term in potential.terms]
+        if explicit_viscosity:
+            forces += [drag for drag, _ in potential.drags()]
+        nodes = replace(nodes, potential=potential)
+        force = load_force(scene.loads, points, t, nodes.dt, body_force_at, size)
+        nodes = nodes if force is None else nodes.accelerated(force)
+        nodes = nodes.pushed(potential.on_nodes(forces)) if forces else nodes
     if body_force is not None and not joined:
         nodes = nodes.accelerated(scatter(stencil, particles.mass * body_force, None, size))
     return nodes
-
-
-def _with_loads(
-    scene: Scene, particles: Particles, nodes: Nodes, t: Scalar, at: float, *, explicit_viscosity: bool
-) -> Nodes:
-    """The nodes with the forces of loads at points of the body, and the terms of their springs and dashpots."""
-    potential, end = nodes.potential, t + at * nodes.dt
-    points = points_of(scene.loads, scene.laws, particles, potential.stencil, total=scene.total)
-    potential = replace(potential, terms=terms_of(scene.loads, points, end))
-    forces = [term.force(potential.displaced(None)) for term in potential.terms]
-    if explicit_viscosity:
-        forces += [drag for drag, _ in potential.drags()]
-    nodes = replace(nodes, potential=potential)
-    force = load_force(scene.loads, points, t, nodes.dt, at, potential.size)
-    nodes = nodes if force is None else nodes.accelerated(force)
-    return nodes.pushed(potential.on_nodes(forces)) if forces else nodes
 
 
 def with_boundaries(
@@ -277,9 +269,11 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar
     images = mirror(scene.boundary, scene.grid, scene.window(particles), t, nodes.dt)
     if scene.rigid_bodies:
         rigid, of_bodies, v, conditions = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
-        loose = nodes.folded(images)
+        loose = nodes.folded(images) if images.images else nodes
         nodes = loose.folded(rigid)
         return replace(nodes, v=jnp.where(of_bodies, v, nodes.velocity), conditions=conditions, loose=loose)
+    if not images.images:
+        return nodes
     if not images.moving:
         return nodes.folded(images)
     # at rest with the mirrors: the velocity less what they add, which is put back

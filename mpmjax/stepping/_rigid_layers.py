@@ -29,18 +29,45 @@ def rigid_layers(
         the maps; the nodes of rigid bodies, shape (n, 1); their velocity at the start of the step [m/s], shape (n, d),
         zero elsewhere; and the conditions on all nodes, those of rigid bodies on these two.
     """
-    places = scene.nodes(particles, 0.0)  # at any time: planes beside rigid bodies rest
+    grid, places = scene.grid, scene.nodes(particles, 0.0)  # at any time: planes beside rigid bodies rest
     of_bodies, velocity = jnp.zeros((len(mass), 1), bool), jnp.zeros_like(places)
     fixed, prescribed, images = conditions.fixed, conditions.velocity, []
     for material in scene.rigid_bodies:
-        body = _body(particles, material)
-        image = _image(scene, body, places, material.layer)
-        held, value = _held(material, body, image, mass, conditions, planes, dt)
+        body, freedom, d = _body(particles, material), material.freedom, grid.dim
+        root, arms = body.root(), places[: len(places) // grid.layers] - body.centre
+        if any(grid.periodic):  # to the nearest image
+            period = jnp.asarray(grid.shape, arms.dtype) * grid.spacing
+            arms = jnp.where(jnp.asarray(grid.periodic), arms - period * jnp.round(arms / period), arms)
+        image = RigidImage(material.layer, grid.layers, arms, jnp.linalg.inv(root) if len(root) else root)
+
+        # which components of V and s are held: what is held of any of the body's nodes is held of all
+        layer_mass = image.own(mass)
+        held = image.own(conditions.fixed) & (layer_mass > 0)[:, None]
+        of_planes = [image.reaches(plane, mass) for plane in planes.images if isinstance(plane, Image)]
+        guided = jnp.zeros(d, bool) if freedom.directions is None else ~jnp.asarray(freedom.directions)
+        by_nodes = held.any(axis=0)
+        by_planes = jnp.stack(of_planes).any(axis=0) if of_planes else jnp.zeros(d, bool)
+        spins = freedom.turns & ~by_nodes.any() & ~by_planes.any()
+        both = jnp.stack([guided | by_nodes | by_planes, jnp.broadcast_to(~spins, (d,))])
+
+        # at what velocity [m/s]: that of the rigid motion nearest to what is prescribed, from its mean, and from the
+        # turning of what is prescribed with all components
+        weight = jnp.where(held, layer_mass[:, None], 0)
+        total = weight.sum(axis=0)
+        per_total = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
+        value = image.own(conditions.velocity)
+        mean, middle = per_total * (weight * value).sum(axis=0), per_total * (weight * arms).sum(axis=0)
+        whole = jnp.where(held.all(axis=1), layer_mass, 0)
+        chords = jnp.where((whole > 0)[:, None], arms - middle, 0)
+        angle = jnp.where(freedom.turns, rotation_of_chords(chords, dt * (value - mean), whole), 0)
+        back = turn(middle[None], angle)[0] - middle if len(angle) else 0.0  # the centre too moves along its chord
+        value = _first_two(image, jnp.where(by_nodes & ~guided, mean - back / dt, 0), root @ angle / dt)[:2]
+
         images.append(image)
-        of_bodies = image.with_own(of_bodies, jnp.ones((len(image.arms), 1), bool))
-        velocity = image.with_own(velocity, _first_two(image, body.velocity, body.root() @ body.spin))
-        fixed = image.with_own(fixed, jnp.zeros(image.arms.shape, bool).at[:2].set(held))
-        prescribed = image.with_own(prescribed, jnp.zeros_like(image.arms).at[:2].set(jnp.where(held, value, 0)))
+        of_bodies = image.with_own(of_bodies, jnp.ones((len(arms), 1), bool))
+        velocity = image.with_own(velocity, _first_two(image, body.velocity, root @ body.spin))
+        fixed = image.with_own(fixed, jnp.zeros(arms.shape, bool).at[:2].set(both))
+        prescribed = image.with_own(prescribed, jnp.zeros_like(arms).at[:2].set(jnp.where(both, value, 0)))
     return Mirror(tuple(images)), of_bodies, velocity, Conditions(fixed, prescribed, conditions.colliders)
 
 
@@ -88,54 +115,6 @@ def _body(particles: Particles, material: RigidMaterial) -> RigidBody:
     return rigid_body(particles.x[rows], particles.v[rows], particles.mass[rows], particles.volume[rows])
 
 
-def _image(scene: Scene, body: RigidBody, places: NodeVector, layer: int) -> RigidImage:
-    grid = scene.grid
-    root, count = body.root(), len(places) // grid.layers
-    per_root = jnp.linalg.inv(root) if len(root) else root
-    arms = places[:count] - body.centre
-    if any(grid.periodic):  # to the nearest image
-        period = jnp.asarray(grid.shape, arms.dtype) * grid.spacing
-        arms = jnp.where(jnp.asarray(grid.periodic), arms - period * jnp.round(arms / period), arms)
-    return RigidImage(layer, grid.layers, arms, per_root)
-
-
 def _first_two(image: RigidImage, velocity: Array, s: Array) -> NodeVector:
     """The layer's nodes with V at the first, s at the second and zero elsewhere, shape (m, d)."""
     return jnp.zeros_like(image.arms).at[0].set(velocity).at[1, : len(s)].set(s)
-
-
-def _held(
-    material: RigidMaterial,
-    body: RigidBody,
-    image: RigidImage,
-    mass: NodeScalar,
-    conditions: Conditions,
-    planes: Mirror,
-    dt: Scalar,
-) -> tuple[Array, Array]:
-    """Which components of V and s are held, and at what [m/s], both of shape (2, d).
-
-    What is held of any of its nodes is held of all. The velocity is that of the rigid motion nearest to what is
-    prescribed.
-    """
-    layer_mass, d = image.own(mass), image.arms.shape[1]
-    held = image.own(conditions.fixed) & (layer_mass > 0)[:, None]
-    of_planes = [image.reaches(plane, mass) for plane in planes.images if isinstance(plane, Image)]
-    guided = jnp.zeros(d, bool) if material.freedom.directions is None else ~jnp.asarray(material.freedom.directions)
-    by_nodes = held.any(axis=0)
-    by_planes = jnp.stack(of_planes).any(axis=0) if of_planes else jnp.zeros(d, bool)
-    spins = material.freedom.turns & ~by_nodes.any() & ~by_planes.any()
-
-    # the mean of what is prescribed, and the turning of what is prescribed with all components
-    weight = jnp.where(held, layer_mass[:, None], 0)
-    total = weight.sum(axis=0)
-    per_total = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
-    value = image.own(conditions.velocity)
-    mean, middle = per_total * (weight * value).sum(axis=0), per_total * (weight * image.arms).sum(axis=0)
-    whole = jnp.where(held.all(axis=1), layer_mass, 0)
-    arms = jnp.where((whole > 0)[:, None], image.arms - middle, 0)
-    angle = jnp.where(material.freedom.turns, rotation_of_chords(arms, dt * (value - mean), whole), 0)
-    back = turn(middle[None], angle)[0] - middle if len(angle) else 0.0  # the centre too moves along its chord
-    velocity = jnp.where(by_nodes & ~guided, mean - back / dt, 0)
-    fixed = jnp.stack([guided | by_nodes | by_planes, jnp.broadcast_to(~spins, (d,))])
-    return fixed, _first_two(image, velocity, body.root() @ angle / dt)[:2]

@@ -18,7 +18,7 @@ from mpmjax.potential import Mirror
 from mpmjax.state import MaterialPoints, Particles, Scene, is_prepared, points_of, prepare, terms_of
 from mpmjax.stepping._contact_surfaces import contact_moduli
 from mpmjax.stepping._integrator import AbstractIntegrator, Explicit
-from mpmjax.stepping._nodes import Nodes, start_nodes
+from mpmjax.stepping._nodes import start_nodes
 
 MOST_STEPS = 2**31 - 1
 """The largest number of steps of a run."""
@@ -165,13 +165,31 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator, t: Sc
     elastic_steepness, viscous_steepness = _steepness(scene, stencil)
     materials = scene.material_points(particles, t)
     stiffest = jnp.concatenate([points.stiffest(particles.dim) for points in materials])
-    most = jnp.concatenate([_stiffest_viscosity(points, particles.dim) for points in materials])
-    z = stiffest * elastic_steepness / density  # per Δt²
-    y = most * viscous_steepness / density  # per Δt
+    z, viscous = stiffest * elastic_steepness / density, []  # per Δt²
+    for points in materials:  # the largest eigenvalue of ∇v ↦ |J| σ_v [Pa s], in the total description a bound of it
+        most = jnp.zeros_like(points.volume)
+        if points.viscosity is not None:
+            most = jnp.abs(points.volume_ratio()) * points.viscosity.stiffest(particles.dim)
+            most = most / (la.principal_frame(points.deformation)[1] ** 2).min(axis=0) if points.total else most
+        viscous.append(most)
+    y = jnp.concatenate(viscous) * viscous_steepness / density  # per Δt
     if not scene.total:  # in the total description there are no such surfaces, and strains add
         dt = _longest(z, y)  # over which walls move
         nodes = start_nodes(scene, particles, t, jnp.where(jnp.isfinite(dt), dt, 1), stencil)
-        z = z + 2 * _straining(scene, particles, nodes)
+        # the fastest rate at which the present acceleration a strains each particle: the eigenvalue of the symmetric
+        # part of ∇a that is largest in magnitude, or |div a| for a law that knows J alone
+        at_rest = ConstrainedNodes(nodes, (), Mirror(()), nodes)
+        contacts = [contact for contact in nodes.contacts if contact.known_at_start]
+        springs = (contact.springs(contact.likely_held(at_rest, nodes.velocity)) for contact in contacts)
+        terms = tuple(spring for spring in springs if spring is not None)
+        pushed = nodes.constrained(Mirror(()), nodes.conditions.fixed, terms)
+        a = pushed.projection.combine(pushed.per_mass(pushed.force) + pushed.acceleration, 0.0)
+        slopes = gather(stencil, nodes.mirror.unfold(a))[1]
+        rates, fastest = la.symmetric_eigen((slopes + la.transpose(slopes)) / 2)[0], []
+        for law, points in zip(scene.laws, materials, strict=True):
+            r = points.rows_of(rates)
+            fastest.append(jnp.abs(r).max(axis=0) if law.measure.axes else jnp.abs(r.sum(axis=0)))
+        z = z + 2 * jnp.concatenate(fastest)
         bounds = nodes.mass, particles.mass, elastic_steepness
         brought = list(zip(nodes.brought_by, nodes.contacts, strict=True))
         z = z + _contact_rate([contact for number, contact in brought if number is not None], *bounds)
@@ -194,24 +212,6 @@ def _longest(z: Array, y: Array) -> Float[Array, ""]:
     none = square == 0  # and not what is NaN, which the least must keep
     steepness = (y + jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, square)))).max()
     return jnp.where(steepness == 0, jnp.inf, 8 / jnp.where(steepness == 0, 1, steepness))
-
-
-def _straining(scene: Scene, particles: Particles, nodes: Nodes) -> Float[Array, "p"]:
-    """The fastest rate [1/s²] at which the present acceleration a strains each particle, shape (p,): the eigenvalue of
-    the symmetric part of ∇a that is largest in magnitude, or |div a| for a law that knows J alone."""
-    at_rest = ConstrainedNodes(nodes, (), Mirror(()), nodes)
-    contacts = [contact for contact in nodes.contacts if contact.known_at_start]
-    springs = (contact.springs(contact.likely_held(at_rest, nodes.velocity)) for contact in contacts)
-    terms = tuple(spring for spring in springs if spring is not None)
-    pushed = nodes.constrained(Mirror(()), nodes.conditions.fixed, terms)
-    a = pushed.projection.combine(pushed.per_mass(pushed.force) + pushed.acceleration, 0.0)
-    _, slopes = gather(nodes.potential.stencil, nodes.mirror.unfold(a))
-    rates = la.symmetric_eigen((slopes + la.transpose(slopes)) / 2)[0]
-    fastest = []
-    for law, group in zip(scene.laws, particles.groups, strict=True):
-        r = rates[:, slice(*group.rows)]
-        fastest.append(jnp.abs(r).max(axis=0) if law.measure.axes else jnp.abs(r.sum(axis=0)))
-    return jnp.concatenate(fastest)
 
 
 def _contact_rate(
@@ -240,15 +240,6 @@ def _between_bodies(scene: Scene, particles: Particles, materials: tuple[Materia
     pairs = combinations(stiff, 2)
     added = [series_stiffness(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in pairs]
     return 4 * STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2
-
-
-def _stiffest_viscosity(points: MaterialPoints, dim: int) -> Float[Array, "q"]:
-    """The largest eigenvalue of ∇v ↦ |J| σ_v for each particle [Pa s]; a bound of it in the total description."""
-    J = jnp.abs(points.volume_ratio())
-    if points.viscosity is None:
-        return jnp.zeros_like(J)
-    most = J * points.viscosity.stiffest(dim)
-    return most / (la.principal_frame(points.deformation)[1] ** 2).min(axis=0) if points.total else most
 
 
 def _steepness(scene: Scene, stencil: Stencil) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ from mpmjax.potential import Forces
 from mpmjax.state import Particles, Scene, State, is_prepared, prepare, with_state
 from mpmjax.stepping._boundary_forces import impulse_on_boundaries, impulse_on_colliders
 from mpmjax.stepping._grid_update import GridUpdate, constrained_update
-from mpmjax.stepping._integrator import AbstractIntegrator, Explicit, NodeMotion, advance
+from mpmjax.stepping._integrator import AbstractIntegrator, Explicit, NodeMotion
 from mpmjax.stepping._nodes import Nodes, folded_at_planes, particles_to_grid, with_boundaries
 from mpmjax.stepping._rigid_layers import moved_rigidly
 
@@ -112,9 +112,16 @@ step_compiled = eqx.filter_jit(step_unchecked)
 def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     """The grid update by an integrator, with contact and friction where the scene has any."""
     if nodes.contacts:
-        return constrained_update(nodes, method)
-    motion, info = advance(nodes, method, method.initial_guess(nodes))
-    return GridUpdate(motion, motion, None if nodes.f is None else method.elastic_impulse(nodes, motion), info)
+        new = constrained_update(nodes, method)
+    else:
+        motion, info = method.advance(nodes, method.initial_guess(nodes))
+        new = GridUpdate(motion, motion, None if nodes.f is None else method.elastic_impulse(nodes, motion), info)
+    if not method.explicit_viscosity and new.motion.resisted is None and nodes.potential.viscous:
+        raise ValueError(
+            f"{type(method).__name__} has explicit_viscosity = False, so its advance must return the velocity that "
+            "viscosity resists, NodeMotion.resisted. It returned None."
+        )
+    return new
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
