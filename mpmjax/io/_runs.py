@@ -56,6 +56,7 @@ from mpmjax.io._schema import decode
 from mpmjax.io._transactional_file import StagedFile, reason, replacing, reporting, undisturbed
 from mpmjax.simulation import (
     Fault,
+    Problem,
     RolloutState,
     Run,
     RunStatistics,
@@ -263,6 +264,7 @@ def record(
     else:
         writer = FrameWriter.create(path, scene, particles, method, dt, start=start, overwrite=overwrite)
     scene, dt_, method = canonical((scene, dt, method), particles.x.dtype)
+    problem = Problem(scene, particles, dt_, method)
     with writer:
         step, state, statistics = writer.last()
         start = step - int(statistics.steps)
@@ -287,13 +289,13 @@ def record(
             before: Callable[[], RolloutState] = partial(initial_state, scene, particles)
             while healthy and step < end:
                 count = min(save_every - (step - start) % save_every, end - step)
-                state, new, before = segment(scene, particles, state, step, count, dt_, method, max_steps=save_every)
+                state, new, before = segment(problem, state, step, count, max_steps=save_every)
                 statistics, step = _merged(statistics, new), step + int(new.steps)
                 healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
                 if healthy:
                     append(step, state, statistics)
                     bar.update(count)
-        run = run_to(state, step, statistics, scene, particles, dt_, method)
+        run = run_to(problem, state, step, statistics)
         try:
             raise_faults(run, particles, before, start)
         except SimulationError as error:
@@ -371,13 +373,10 @@ def load(path: str | os.PathLike) -> Run:
         check_numbers(scene, described["dt"], steps, frames.particles)
     last, statistics = _at((frames, tallies), -1)
     return run_to(
+        Problem(scene, particles, canonical(described["dt"], dtype), method),
         last,
         steps[-1],
         statistics,
-        scene,
-        particles,
-        canonical(described["dt"], dtype),
-        method,
         steps=canonical(steps, dtype),
         frames=frames.particles,
         collider_impulse=frames.collider_impulse,
