@@ -189,13 +189,10 @@ class Scene(eqx.Module):
         self.kernel = kernel
         rough = description.total and kernel == BSpline(2)  # where moving least squares is
         self.gradient = gradient or (SplineGradient() if rough else MLSGradient())
-        self.transfer = transfer
-        self.description = description
-        self.body_force = body_force
-        self.boundary_forces = boundary_forces
+        self.transfer, self.description = transfer, description
+        self.body_force, self.boundary_forces = body_force, boundary_forces
         self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
-        self.bodies = bodies
-        self.volume = volume
+        self.bodies, self.volume = bodies, volume
 
     def __check_init__(self):
         d = self.grid.dim
