@@ -33,7 +33,7 @@ def program(method=mpm.Explicit(), *, d=2, nodes=12, material=LAW, periodic=Fals
     particles = mpm.join(*[block] * len(material)) if isinstance(material, tuple) else block
     scene, dt, method = canonical((mpm.Scene(grid, material, **scene), 1e-3, method), jnp.float64)
     particles = mpm.prepare(scene, particles)
-    problem = Problem(scene, particles, scene.stencil(particles) if scene.total else None, dt, method)
+    problem = Problem(scene, particles, dt, method, scene.stencil(particles) if scene.total else None)
     arrays, rest = eqx.partition(problem, eqx.is_array)
 
     def step(arrays):

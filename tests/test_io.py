@@ -19,7 +19,7 @@ import mpmjax as mpm
 import mpmjax.io._runs
 from mpmjax.io._runs import FrameWriter, load, record, save
 from mpmjax.io._transactional_file import StagedFile, undisturbed
-from mpmjax.simulation._diffrax import RolloutState, initial_state
+from mpmjax.simulation._diffrax import Problem, RolloutState, initial_state
 from mpmjax.simulation._run import Run, RunStatistics, no_steps
 from mpmjax.simulation._simulate import integrate
 from mpmjax.state._particles import Particles, state_of, with_state
@@ -30,6 +30,11 @@ STEPPERS = {
     "explicit": (mpm.Explicit(), 5e-3),
     "semi_implicit": (mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(1e-4)), 3e-2),
 }
+
+
+def problem(run: Run) -> Problem:
+    """What of a run does not change."""
+    return Problem(run.scene, run.final, run.dt, run.method)
 
 
 def made_up(d: int, dtype=jnp.float64, description=DESCRIPTIONS["updated"], transfer=TRANSFERS["apic"], p=7) -> Run:
@@ -263,7 +268,7 @@ def test_a_file_being_written_can_be_read(tmp_path):
     """Every frame appended is on its way to the disk: a copy of the open file, as a kill leaves it, holds them all."""
     path, run = tmp_path / "run.h5", made_up(2)
     frames = [jax.tree.map(lambda a, i=i: a[i], run.frames) for i in range(3)]
-    with FrameWriter.create(path, run.scene, run.final, run.method, run.dt) as writer:
+    with FrameWriter.create(path, problem(run)) as writer:
         for i, frame in enumerate(frames):
             writer.append(i, RolloutState(frame, None), run.statistics)
             shutil.copy(path, tmp_path / "copy.h5")
@@ -287,7 +292,7 @@ def test_a_signal_is_told_what_the_file_holds(tmp_path, monkeypatch):
             threads[-1].start()
             threads[-1].join(0.2)
 
-    with FrameWriter.create(path, run.scene, run.final, run.method, run.dt) as writer:
+    with FrameWriter.create(path, problem(run)) as writer:
         frame = RolloutState(jax.tree.map(lambda a: a[0], run.frames), None)
         writer.append(0, frame, run.statistics)
         monkeypatch.setattr(StagedFile, "commit", committed)
@@ -322,7 +327,7 @@ def test_an_interrupt_leaves_complete_frames_and_can_be_resumed(tmp_path, monkey
         assert file["VTKHDF/Points"].shape == (3 * p, 3)
         file["VTKHDF/Points"].resize(3 * p + 5, axis=0)
     assert_same(load(path).frames, jax.tree.map(lambda a: a[:2], single.frames))
-    FrameWriter.resume(path, scene, prepare(scene, particles), mpm.Explicit(), 5e-3).close()
+    FrameWriter.resume(path, Problem(scene, prepare(scene, particles), 5e-3, mpm.Explicit())).close()
     with h5py.File(path) as file:
         assert {len(d) for d in file["VTKHDF/PointData"].values()} | {len(file["VTKHDF/Points"])} == {2 * p}
         assert len(file["mpmjax/frames"]) == len(file["VTKHDF/Steps/Values"]) == 2
@@ -516,11 +521,11 @@ def test_what_is_no_run_is_not_replaced(tmp_path):
     path.write_bytes(b"")
     save(path, run)
     before = path.read_bytes()
-    with FrameWriter.resume(path, run.scene, run.final, run.method, run.dt):
+    with FrameWriter.resume(path, problem(run)):
         for attempt in (
             lambda: save(path, run),
-            lambda: FrameWriter.create(path, run.scene, run.final, run.method, run.dt, overwrite=True),
-            lambda: FrameWriter.resume(path, run.scene, run.final, run.method, run.dt),
+            lambda: FrameWriter.create(path, problem(run), overwrite=True),
+            lambda: FrameWriter.resume(path, problem(run)),
         ):
             with pytest.raises(ValueError, match=r"other is being written by another run: wait until that ends"):
                 attempt()
@@ -553,7 +558,7 @@ def test_another_run_is_not_continued(where, value, message, tmp_path):
     before = (tmp_path / "run.h5").read_bytes()
     other = eqx.tree_at(where, run, value)
     with pytest.raises(ValueError, match=message):
-        FrameWriter.resume(tmp_path / "run.h5", other.scene, other.final, other.method, other.dt)
+        FrameWriter.resume(tmp_path / "run.h5", problem(other))
     assert (tmp_path / "run.h5").read_bytes() == before
 
 
@@ -562,7 +567,7 @@ def test_a_run_in_another_precision_is_not_continued(tmp_path):
     save(tmp_path / "run.h5", made_up(2))
     run = made_up(2, jnp.float32)
     with pytest.raises(ValueError, match="its dtype is 'float64' instead of 'float32'"):
-        FrameWriter.resume(tmp_path / "run.h5", run.scene, run.final, run.method, run.dt)
+        FrameWriter.resume(tmp_path / "run.h5", problem(run))
 
 
 def test_a_law_of_ones_own_cannot_be_saved(tmp_path):
@@ -669,7 +674,7 @@ def test_a_file_that_leads_elsewhere_is_refused(lead_away, tmp_path):
     with h5py.File(path, "r+") as file:
         lead_away(file, str(tmp_path / "other.h5"))
     before = {p: p.read_bytes() for p in tmp_path.iterdir()}
-    for read in (load, lambda path: FrameWriter.resume(path, run.scene, run.final, run.method, run.dt)):
+    for read in (load, lambda path: FrameWriter.resume(path, problem(run))):
         with pytest.raises(ValueError, match=r"run\.h5: /.*, which no run of mpmjax has: restore it from a copy"):
             read(path)
     assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
@@ -695,7 +700,7 @@ def test_zeros_are_no_data(tmp_path):
         tried += 1
         data[start : start + size] = bytes(size)
         path.write_bytes(data)
-        for read in (load, lambda path: FrameWriter.resume(path, run.scene, run.final, run.method, run.dt)):
+        for read in (load, lambda path: FrameWriter.resume(path, problem(run))):
             with pytest.raises(ValueError, match=r"is damaged \(.* not what was written\): restore it"):
                 read(path)
     assert tried > 20
@@ -778,7 +783,7 @@ def test_a_frame_that_was_never_written_is_no_frame(tmp_path):
             file[name].resize(length - file[name].chunks[0], axis=0)  # which drops the chunk
             file[name].resize(length, axis=0)
             assert not any(file[name][-1:].tobytes())
-        for read in (load, lambda path: FrameWriter.resume(path, run.scene, run.final, run.method, run.dt)):
+        for read in (load, lambda path: FrameWriter.resume(path, problem(run))):
             with pytest.raises(ValueError, match=rf"is damaged \(frame \d of {name} was never written\)"):
                 read(path)
 
@@ -834,7 +839,7 @@ def test_a_flipped_bit_is_caught_or_harmless(tmp_path):
         except ValueError:
             caught.append(bit)
         try:
-            with FrameWriter.resume(path, run.scene, run.final, run.method, run.dt) as writer:
+            with FrameWriter.resume(path, problem(run)) as writer:
                 assert_same(writer.last(), (7, RolloutState(state_of(run.final), None), run.statistics))
         except ValueError:
             continue
@@ -845,7 +850,7 @@ def test_a_flipped_bit_is_caught_or_harmless(tmp_path):
 def test_no_steps_is_the_row_of_a_start(tmp_path):
     """A recorded run's first frame has the empty statistics."""
     run = made_up(2)
-    with FrameWriter.create(tmp_path / "run.h5", run.scene, run.final, run.method, run.dt, start=3) as writer:
+    with FrameWriter.create(tmp_path / "run.h5", problem(run), start=3) as writer:
         step, state, statistics = writer.last()
     assert step == 3
     assert_same((state, statistics), (initial_state(run.scene, run.final), no_steps(jnp.float64)))

@@ -326,7 +326,7 @@ def test_a_collapsed_particle_is_at_fault_in_every_law(law):
         scene = mpm.Scene(mpm.Grid((6, 6), 1.0), law, description=description)
         particles = mpm.prepare(scene, mpm.Particles(still + place, still, jnp.ones(6), jnp.ones(6)))
         particles = replace(particles, deformations=(F if law.measure.axes else J,))
-        faults = faulty_particles(Problem(scene, particles, None, 1.0, mpm.Explicit()), state_of(particles), 0.0)
+        faults = faulty_particles(Problem(scene, particles, 1.0, mpm.Explicit()), state_of(particles), 0.0)
         found = faults.get(Fault.COLLAPSED)
         assert (None if found is None else found.tolist()) == expected
 

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.spatial
 
 from mpmjax.checks import canonical, require, shape_of
-from mpmjax.simulation import SimulationError, initial_state, no_steps, raise_faults, run_to, segment
+from mpmjax.simulation import Problem, SimulationError, initial_state, no_steps, raise_faults, run_to, segment
 from mpmjax.state import Particles, Scene, State, prepare, with_state
 from mpmjax.stepping import TRBDF2, AbstractIntegrator, Explicit, stable_dt
 
@@ -156,15 +156,14 @@ class Bench(NamedTuple):
         faulty run has no states, or raises with `throw`."""
         begun, dtype = time.perf_counter(), self.particles.x.dtype
         scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)
+        problem = Problem(scene, self.particles, dt, method)
         state, states, statistics = initial_state(scene, self.particles), [], no_steps(dtype)
         for k in range(frames):
-            state, new, before = segment(
-                scene, self.particles, state, k * each, each, dt, method, max_steps=_MOST_STEPS
-            )
+            state, new, before = segment(problem, state, k * each, each, max_steps=_MOST_STEPS)
             statistics = statistics.merged(new)
             if not bool(jax.block_until_ready(statistics.healthy)):
                 if throw:
-                    run = run_to(state, statistics.steps, statistics, scene, self.particles, dt, method)
+                    run = run_to(problem, state, statistics.steps, statistics)
                     raise_faults(run, self.particles, before, 0)
                 return Timed(None, 0.0, time.perf_counter() - begun)
             states.append(state.particles)

@@ -315,7 +315,7 @@ def _budget(
                 turn = scene.stencil(after).moment - stencil.moment
                 kept = kept + (before.mass * (C_new**2 * turn).sum(axis=(0, 1))).sum() / 2
 
-        averaging = jnp.zeros((), v0.dtype)  # by the averages of the particles' new places
+        averaging = jnp.zeros((), v0.dtype)  # by the averages at the particles' new positions
         if scene.volume is not None:
             pairs = zip(potential.material_points, scene.material_points(after), strict=True)
             changes = (n.volume * (n.energy_density(n.deformation) - o.energy_density(n.deformation)) for o, n in pairs)

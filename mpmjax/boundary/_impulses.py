@@ -14,6 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Float, Int, NodeVector, Scalar
 from mpmjax.boundary._boundary import AbstractBoundary
@@ -47,7 +48,8 @@ class Impulses(eqx.Module):
 
 def no_impulses(count: int, dim: int, dtype: Any) -> Impulses:
     """No impulse yet on a number of colliders or boundaries."""
-    return Impulses(jnp.zeros((count, dim), dtype), jnp.zeros((count, len(pairs(dim))), dtype))
+    zeros = np.zeros((count, dim), dtype), np.zeros((count, len(pairs(dim))), dtype)
+    return Impulses(*jax.device_put(zeros))  # by NumPy: each operation of JAX by itself is a program to compile
 
 
 class OwnedCouple(eqx.Module):

@@ -25,7 +25,8 @@ import numpy as np
 from mpmjax.checks import canonical, require, require_finite, require_positive
 from mpmjax.io._schema import decode, encode
 from mpmjax.io._transactional_file import StagedFile, reason, require_no_writer
-from mpmjax.state import Particles, Scene, State, by_material, history_arrays
+from mpmjax.simulation import Problem
+from mpmjax.state import Scene, State, by_material, history_arrays
 from mpmjax.stepping import AbstractIntegrator
 
 File = Any  # an `h5py.File`, whose own annotations do not say what a name leads to
@@ -333,10 +334,10 @@ def _padded(a: np.ndarray, diagonal: float) -> np.ndarray:
     return padded.reshape(-1, 9)
 
 
-def describe(scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any) -> dict[str, Any]:
+def describe(run: Problem) -> dict[str, Any]:
     """The description of a run in its file, without the frames."""
-    dtype = particles.x.dtype
-    scene, method, dt = canonical((scene, method, dt), dtype)
+    particles, dtype = run.particles, run.particles.x.dtype
+    scene, method, dt = canonical((run.scene, run.method, run.dt), dtype)
     arrays: dict[str, np.ndarray] = {}
     parts = {name: getattr(particles, name) for name in _UNCHANGING}
     return {

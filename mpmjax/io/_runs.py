@@ -56,6 +56,7 @@ from mpmjax.io._schema import decode
 from mpmjax.io._transactional_file import StagedFile, reason, replacing, reporting, undisturbed
 from mpmjax.simulation import (
     Fault,
+    Problem,
     RolloutState,
     Run,
     RunStatistics,
@@ -83,36 +84,22 @@ class FrameWriter:
         self._kept = self._standing()
 
     @classmethod
-    def create(
-        cls,
-        path: str | os.PathLike,
-        scene: Scene,
-        particles: Particles,
-        method: AbstractIntegrator,
-        dt: Any,
-        *,
-        start: int = 0,
-        overwrite: bool = False,
-    ) -> "FrameWriter":
-        """Begin a file with prepared particles as its first frame, of step `start`. It takes its place when that is
-        on the disk; whatever is wrong before leaves what was there."""
+    def create(cls, path: str | os.PathLike, run: Problem, *, start: int = 0, overwrite: bool = False) -> "FrameWriter":
+        """Begin a file with a run's prepared particles as its first frame, of step `start`. It takes its place when
+        that is on the disk; whatever is wrong before leaves what was there."""
         path = Path(path)
         check_place(path, overwrite=overwrite)
         with undisturbed():
-            with _new(path, scene, particles, method, dt) as writer:
-                writer.append(start, initial_state(scene, particles), no_steps(particles.x.dtype))
-            return cls.resume(path, scene, particles, method, dt)
+            with _new(path, run) as writer:
+                writer.append(start, initial_state(run.scene, run.particles), no_steps(run.particles.x.dtype))
+            return cls.resume(path, run)
 
     @classmethod
-    def resume(
-        cls, path: str | os.PathLike, scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any
-    ) -> "FrameWriter":
+    def resume(cls, path: str | os.PathLike, run: Problem) -> "FrameWriter":
         """Open a file to append frames to it, after checking that it is whole, of the same run, and not being
         written. Frames that a killed writer left incomplete are cut off."""
         path = Path(path)
-        described = describe(scene, particles, method, dt)
-        begin = initial_state(scene, particles)
-        rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
+        described, begin, rows = _first(run)
         check_hdf5(path)
         staged = StagedFile(path)
         try:
@@ -201,10 +188,9 @@ class FrameWriter:
 
 
 @contextmanager
-def _new(path: Path, scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any) -> Iterator[FrameWriter]:
+def _new(path: Path, run: Problem) -> Iterator[FrameWriter]:
     """A writer of a new file, without frames, which is at `path` when the block has ended without an error."""
-    described, begin = describe(scene, particles, method, dt), initial_state(scene, particles)
-    rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
+    described, begin, rows = _first(run)
     with replacing(path) as aside, StagedFile(aside) as staged:
         file = created(staged, path, described, rows)
         file.flush()
@@ -258,11 +244,12 @@ def record(
     dt = step_for(scene, particles, t1, dt, method, start)
     end = start + number_of_steps(t1, dt, start, particles.x.dtype)
     save_every = min(require_whole("save_every", save_every, 1), end - start)
-    if resume:
-        writer = FrameWriter.resume(path, scene, particles, method, dt)
-    else:
-        writer = FrameWriter.create(path, scene, particles, method, dt, start=start, overwrite=overwrite)
     scene, dt_, method = canonical((scene, dt, method), particles.x.dtype)
+    problem = Problem(scene, particles, dt_, method)
+    if resume:
+        writer = FrameWriter.resume(path, problem)
+    else:
+        writer = FrameWriter.create(path, problem, start=start, overwrite=overwrite)
     with writer:
         step, state, statistics = writer.last()
         start = step - int(statistics.steps)
@@ -287,13 +274,13 @@ def record(
             before: Callable[[], RolloutState] = partial(initial_state, scene, particles)
             while healthy and step < end:
                 count = min(save_every - (step - start) % save_every, end - step)
-                state, new, before = segment(scene, particles, state, step, count, dt_, method, max_steps=save_every)
+                state, new, before = segment(problem, state, step, count, max_steps=save_every)
                 statistics, step = _merged(statistics, new), step + int(new.steps)
                 healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
                 if healthy:
                     append(step, state, statistics)
                     bar.update(count)
-        run = run_to(state, step, statistics, scene, particles, dt_, method)
+        run = run_to(problem, state, step, statistics)
         try:
             raise_faults(run, particles, before, start)
         except SimulationError as error:
@@ -333,7 +320,7 @@ def save(path: str | os.PathLike, run: Run) -> None:
     states = (state_of(run.final),) if frames is None else (frames, state_of(run.final))
     check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
     unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.statistics)
-    with _new(path, run.scene, run.final, run.method, run.dt) as writer:
+    with _new(path, Problem(run.scene, run.final, run.dt, run.method)) as writer:
         for i in range(count):
             frame = _at((frames, run.collider_impulse, run.boundary_impulse), i)
             writer.append(int(steps[i]), RolloutState(*frame), unknown)
@@ -371,13 +358,10 @@ def load(path: str | os.PathLike) -> Run:
         check_numbers(scene, described["dt"], steps, frames.particles)
     last, statistics = _at((frames, tallies), -1)
     return run_to(
+        Problem(scene, particles, canonical(described["dt"], dtype), method),
         last,
         steps[-1],
         statistics,
-        scene,
-        particles,
-        canonical(described["dt"], dtype),
-        method,
         steps=canonical(steps, dtype),
         frames=frames.particles,
         collider_impulse=frames.collider_impulse,
@@ -392,6 +376,12 @@ def _at(tree: Any, index: int | slice) -> Any:
     """The entries of arrays along their first axis. NumPy takes them: each operation of JAX by itself is a program to
     compile."""
     return jax.tree.map(lambda a: jax.device_put(np.asarray(a)[index]), tree)
+
+
+def _first(run: Problem) -> tuple[dict[str, Any], RolloutState, dict[str, np.ndarray]]:
+    """A run's description, its state at the start, and the rows of a frame of it."""
+    described, begin = describe(run), initial_state(run.scene, run.particles)
+    return described, begin, _rows(0, 0, described["dt"], begin, no_steps(run.particles.x.dtype))
 
 
 def _rows(frame: int, step: int, dt: Any, state: RolloutState, statistics: RunStatistics) -> dict[str, np.ndarray]:

@@ -1,6 +1,10 @@
 """Rollouts: many steps, driven by diffrax, and their faults in words."""
 
-from mpmjax.simulation._diffrax import RolloutState as RolloutState, initial_state as initial_state
+from mpmjax.simulation._diffrax import (
+    Problem as Problem,
+    RolloutState as RolloutState,
+    initial_state as initial_state,
+)
 from mpmjax.simulation._faults import (
     LARGEST_LINEARISATION_ERROR as LARGEST_LINEARISATION_ERROR,
     raise_faults as raise_faults,

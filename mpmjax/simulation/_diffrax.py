@@ -80,9 +80,9 @@ class Problem(eqx.Module):
 
     scene: Scene
     particles: Particles
-    stencil: Stencil | None
     dt: Scalar
     method: AbstractIntegrator
+    stencil: Stencil | None = None
     observe: Callable[[Scene, Particles], Any] | None = None
     start: Scalar = 0.0  # number of the first step
     until: Scalar = np.inf  # number of steps after which a watched run ends, if it is less than were asked for
@@ -141,13 +141,10 @@ def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -
 
 def gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
     """The gravest fault that any particle has, of faults in their order, by one reduction over the particles."""
-    rank, worst = jnp.zeros_like(next(iter(faults.values())), jnp.int32), jnp.asarray(Fault.NONE, jnp.int32)
-    for place, particles in enumerate(reversed(faults.values()), 1):
-        rank = jnp.where(particles, place, rank)
-    most = rank.max(initial=0)
-    for place, fault in enumerate(reversed(faults), 1):
-        worst = jnp.where(most == place, fault, worst)
-    return worst
+    rank = jnp.zeros_like(next(iter(faults.values())), jnp.int32)
+    for number, particles in enumerate(reversed(faults.values()), 1):
+        rank = jnp.where(particles, number, rank)
+    return jnp.asarray([Fault.NONE, *reversed(faults)], jnp.int32)[rank.max(initial=0)]
 
 
 _GRAVEST_FIRST = (Fault.NOT_FINITE, Fault.PASSED, Fault.OUTSIDE, Fault.INADMISSIBLE, Fault.COLLAPSED)

@@ -27,7 +27,7 @@ def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState],
     if fault != Fault.NONE:
         previous = before()
         step = start + int(run.statistics.fault_step)
-        problem = Problem(run.scene, run.final, None, run.dt, run.method)
+        problem = Problem(run.scene, run.final, run.dt, run.method)
         bad = faulty_particles(problem, state_of(run.final), step * run.dt)
         _, what, advice = _WORDS[fault]
         if fault == Fault.PASSED:

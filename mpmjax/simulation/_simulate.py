@@ -132,34 +132,15 @@ def simulate(
         numbers = 2 * (d + 1) * scene.grid.size + (d + d * d) * particles.count
         step_bytes = state_bytes + numbers * dtype.itemsize
         adjoint = checkpointed(count, state_bytes, step_bytes, checkpoint_bytes, stops=not traced)
-    go = partial(
-        integrate,
-        scene,
-        particles,
-        begin,
-        first,
-        None,
-        dt_,
-        method,
-        slot,
-        until=np.asarray(np.inf, dtype),
-        max_steps=count,
-        save_every=save_every,
-        observe=observe,
-        adjoint=adjoint,
-        progress=progress,
-        watch=not traced,
-    )
-    end = go()
+    problem = Problem(scene, particles, dt_, method, observe=observe, start=first, slot=slot, save_every=save_every)
+    go = partial(integrate, problem, begin, max_steps=count, adjoint=adjoint, progress=progress, watch=not traced)
+    end = go(until=np.asarray(np.inf, dtype))
     values, on_colliders, on_boundaries = end.saved
     run = run_to(
+        problem,
         end.state,
         end.step,
         end.statistics,
-        scene,
-        particles,
-        dt_,
-        method,
         steps=end.steps,
         frames=values if observe is None else None,
         observed=None if observe is None else values,
@@ -209,7 +190,7 @@ def rollout(
 def _rollout(
     scene: Scene, particles: Particles, dt: Scalar, method: AbstractIntegrator, steps: int, start: Float[Array, ""]
 ) -> Particles:
-    problem = Problem(scene, particles, scene.stencil(particles) if scene.total else None, dt, method, start=start)
+    problem = Problem(scene, particles, dt, method, scene.stencil(particles) if scene.total else None, start=start)
 
     def body(y: RolloutState, n: Array) -> tuple[RolloutState, None]:
         here, y = problem.resorted(y, n)
@@ -263,35 +244,28 @@ class End(NamedTuple):
 
 @eqx.filter_jit
 def integrate(
-    scene: Scene,
-    particles: Particles,
+    problem: Problem,
     state: RolloutState,
-    start: Float[Array, ""],
-    count: Float[Array, ""] | None,
-    dt: Scalar,
-    method: AbstractIntegrator,
-    slot: Scalar = 0.0,
+    count: Float[Array, ""] | None = None,
     *,
     until: Scalar | Float[np.ndarray, ""],
     max_steps: int,
-    save_every: int | None = None,
-    observe: Callable[[Scene, Particles], Any] | None = None,
     adjoint: diffrax.AbstractAdjoint = diffrax.ForwardMode(),  # the plain loop
     progress: bool = False,
     watch: bool = True,
 ) -> End:
-    """Integrate `count` ≤ `max_steps` steps from step `start`, at which the particles have this state.
-
-    Adjoint solves report through the `slot` (see `Reporting`). With `watch` the run stops at a fault, and `until` so
-    many steps.
+    """Integrate `count` ≤ `max_steps` steps from a problem's start, at which the particles have this state. With
+    `watch` the run stops at a fault, and `until` so many steps.
 
     Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it
     compiles, and not a program of two thousand operations.
     """
+    scene, particles, start, save_every = problem.scene, problem.particles, problem.start, problem.save_every
+    dtype = particles.x.dtype
+    zero, one, all_steps = (np.asarray(n, dtype) for n in (0, 1, max_steps))
+    until, slot = (jnp.asarray(a, dtype) for a in (until, problem.slot))
     stencil = scene.stencil(particles) if scene.total else None
-    zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
-    until, slot = (jnp.asarray(a, start.dtype) for a in (until, slot))
-    problem = Problem(scene, particles, stencil, dt, method, observe, start, until, slot, save_every=save_every)
+    problem = replace(problem, stencil=stencil, until=until, slot=slot)
     if not watch:  # the fault of the start, from values that were not known when they were given
         arrays, rest = eqx.partition((problem, state), eqx.is_array)
         constant, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
@@ -327,10 +301,10 @@ def integrate(
     )
     times, values, (statistics, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
-    steps, saved = jnp.zeros((0,), start.dtype), (None, None, None)
+    steps, saved = jnp.zeros((0,), dtype), (None, None, None)
     if save_every is not None:
         steps, saved = start + jnp.round(times["frames"]), values["frames"]
-    return End(steps, saved, final, start + statistics.steps.astype(start.dtype), statistics, report)
+    return End(steps, saved, final, start + statistics.steps.astype(dtype), statistics, report)
 
 
 def _before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
@@ -341,43 +315,25 @@ def _before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunSt
 
 
 def segment(
-    scene: Scene,
-    particles: Particles,
-    begin: RolloutState,
-    step: int,
-    count: int,
-    dt: Scalar,
-    method: AbstractIntegrator,
-    *,
-    max_steps: int,
+    problem: Problem, begin: RolloutState, step: int, count: int, *, max_steps: int
 ) -> tuple[RolloutState, RunStatistics, Callable[[], RolloutState]]:
     """The state after `count` ≤ `max_steps` steps from step `step`, their statistics, and a function that returns the
-    last good state. The arguments are canonical. Segments of all lengths are one compiled program."""
-    dtype = particles.x.dtype
-    first, number, until = jnp.asarray(step, dtype), jnp.asarray(count, dtype), np.asarray(np.inf, dtype)
-    go = partial(integrate, scene, particles, begin, first, number, dt, method, until=until, max_steps=max_steps)
-    end = go()
+    last good state. The problem is canonical. Segments of all lengths are one compiled program."""
+    first, number = canonical((step, count), problem.particles.x.dtype)
+    go = partial(integrate, replace(problem, start=first), begin, number, max_steps=max_steps)
+    end = go(until=np.asarray(np.inf, first.dtype))
     return end.state, end.statistics, partial(_before_fault, go, begin, end.statistics)
 
 
-def run_to(
-    state: RolloutState,
-    step: Any,
-    statistics: RunStatistics,
-    scene: Scene,
-    particles: Particles,
-    dt: Scalar,
-    method: AbstractIntegrator,
-    **saved: Any,
-) -> Run:
+def run_to(problem: Problem, state: RolloutState, step: Any, statistics: RunStatistics, **saved: Any) -> Run:
     """The run that ended in this state at step `step`; `saved` are its fields that hold more than its end."""
-    dtype = particles.x.dtype
+    dtype = problem.particles.x.dtype
     saved = {"steps": jax.device_put(np.zeros((0,), dtype)), "frames": None, "observed": None} | saved
     return Run(
-        scene=scene,
-        method=method,
-        dt=dt,
-        final=with_state(particles, state.particles),
+        scene=problem.scene,
+        method=problem.method,
+        dt=problem.dt,
+        final=problem.at(state.particles),
         final_step=jnp.asarray(step, dtype),
         statistics=statistics,
         final_collider_impulse=state.collider_impulse,

@@ -204,13 +204,13 @@ def _fits(scene: Scene, particles: Particles) -> tuple[Bool[Array, "p"], list[Bo
 
 
 def _check_placement(scene: Scene, particles: Particles) -> None:
-    place = np.asarray(scene.anchor(particles))
+    x = np.asarray(scene.anchor(particles))
     require_finite("Particle positions", particles.x)
     require_finite("Particle velocities", particles.v)
     for boundary in scene.boundary:
         for wall in boundary.walls():
             name, keep = type(boundary).__name__, "above" if wall.inward > 0 else "below"
-            beyond = wall.inward * (np.asarray(place[:, wall.axis]) - wall.position) < 0
+            beyond = wall.inward * (x[:, wall.axis] - np.asarray(wall.position)) < 0
             require(
                 not wall.mirrored or ~beyond,
                 f"Particles must lie {keep} the {name} at {wall.position:g} on axis {wall.axis}, but particle "
@@ -226,7 +226,7 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
     if at_rest and not inside.all():
         first = int(np.argmin(inside))
         raise ValueError(
-            f"Every particle's stencil must lie in the window; particle {first} at {place[first]} and "
+            f"Every particle's stencil must lie in the window; particle {first} at {x[first]} and "
             f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
         )
     for body in scene.rigid_bodies:

@@ -189,13 +189,10 @@ class Scene(eqx.Module):
         self.kernel = kernel
         rough = description.total and kernel == BSpline(2)  # where moving least squares is
         self.gradient = gradient or (SplineGradient() if rough else MLSGradient())
-        self.transfer = transfer
-        self.description = description
-        self.body_force = body_force
-        self.boundary_forces = boundary_forces
+        self.transfer, self.description = transfer, description
+        self.body_force, self.boundary_forces = body_force, boundary_forces
         self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
-        self.bodies = bodies
-        self.volume = volume
+        self.bodies, self.volume = bodies, volume
 
     def __check_init__(self):
         d = self.grid.dim
@@ -284,7 +281,7 @@ class Scene(eqx.Module):
     def guides(self) -> dict[int, int]:
         """Report index of each rigid body's guide, keyed by material; guides follow the boundaries."""
         guided = [body.number for body in self.rigid_bodies if body.freedom.guided]
-        return {number: len(self.boundary) + place for place, number in enumerate(guided)}
+        return {number: len(self.boundary) + i for i, number in enumerate(guided)}
 
     @property
     def keeps_gradient(self) -> bool:
@@ -306,11 +303,11 @@ class Scene(eqx.Module):
         )
         if (averaged := self.volume) is None:
             return materials
-        grid, window, places = self.grid.with_layers(1), self.window(particles), self.on_grid(particles, t)
+        grid, window, positions = self.grid.with_layers(1), self.window(particles), self.on_grid(particles, t)
         images = mirror(self.boundary, grid, window).without_ties()
 
         def average(points: MaterialPoints) -> VolumeAverage:
-            return volume_average(grid, window, places[slice(*points.rows)], points.volume, images)
+            return volume_average(grid, window, positions[slice(*points.rows)], points.volume, images)
 
         return tuple(replace(q, average=average(q)) if averaged.covers(i) else q for i, q in enumerate(materials))
 
@@ -341,7 +338,7 @@ class Scene(eqx.Module):
     @property
     def mirrors(self) -> tuple[MirrorPlace, ...]:
         """Where the mirrors of the boundaries are."""
-        return tuple(place for boundary in self.boundary if (place := boundary.mirror()) is not None)
+        return tuple(plane for boundary in self.boundary if (plane := boundary.mirror()) is not None)
 
     def shift(self, t: Scalar) -> Float[Array, "d"] | None:
         """How far the grid has moved at time t [m], shape (d,), with planes that move, and with the derivative by the
@@ -350,9 +347,9 @@ class Scene(eqx.Module):
             return None
         along = {} if self.total else {axis: motion.at(t)[axis] for axis, motion in self.moving_mirrors.items()}
         for axis in range(self.grid.dim):
-            places = [mirror.position for mirror in self.mirrors if mirror.axis == axis]
-            if is_traced(places):
-                along[axis] = along.get(axis, 0) + carried_by(*places)
+            positions = [mirror.position for mirror in self.mirrors if mirror.axis == axis]
+            if is_traced(positions):
+                along[axis] = along.get(axis, 0) + carried_by(*positions)
         if not along:
             return None
         rest = jnp.zeros_like(next(iter(along.values())))
@@ -360,8 +357,8 @@ class Scene(eqx.Module):
 
     def nodes(self, particles: Particles, t: Scalar) -> NodeVector:
         """Positions of the window's nodes at time t [m], shape (n, d)."""
-        places, shift = self.grid.nodes(self.window(particles)), self.shift(t)
-        return places if shift is None else places + shift
+        x, shift = self.grid.nodes(self.window(particles)), self.shift(t)
+        return x if shift is None else x + shift
 
     def window(self, particles: Particles) -> Int[Array, "d"]:
         """Lattice index of the grid window's first node."""
@@ -374,22 +371,16 @@ class Scene(eqx.Module):
 
     def on_grid(self, particles: Particles, t: Scalar) -> Array:
         """The `anchor` relative to the grid at time t [m], shape (p, d)."""
-        place, shift = self.anchor(particles), self.shift(t)
-        return place if shift is None else place - shift
+        x, shift = self.anchor(particles), self.shift(t)
+        return x if shift is None else x - shift
 
     def stencil(self, particles: Particles, t: Scalar = 0.0) -> Stencil:
         """The particles' stencil at time t, with the moving-least-squares gradient where the transfer needs it."""
         window, layer = self.window(particles), None
         if self.bodies is not None:  # each body has a layer of nodes of its own
             layer = np.repeat(self.bodies.numbers(len(self.laws)), particles.sizes).astype(np.int32)
-        stencil = make_stencil(
-            self.kernel,
-            self.gradient,
-            self.grid,
-            window,
-            self.on_grid(particles, t),
-            layer=layer,
-        )
+        x = self.on_grid(particles, t)
+        stencil = make_stencil(self.kernel, self.gradient, self.grid, window, x, layer=layer)
         if self.kernel.order > 1:
             return stencil
         images = mirror(self.boundary, self.grid, window).without_ties()

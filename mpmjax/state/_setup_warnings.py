@@ -47,7 +47,7 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
         name, walls = f"{type(condition).__name__} (boundary {number})", condition.walls()
         if inside is None:
             nearest = _nearest(condition, grid, volume)
-            beyond = [wall.inward * (x[:, wall.axis] - wall.position) < nearest for wall in walls]
+            beyond = [wall.inward * (x[:, wall.axis] - np.asarray(wall.position)) < nearest for wall in walls]
             inside = np.any(beyond, axis=0).sum()
         if inside and condition.pushes:
             warn(
@@ -190,9 +190,9 @@ def _filled(
     """How many times its space each node of a lattice holds, by linear weights, which those of one body fill to a
     tenth, and where the fullest is [m]; None where that is too much to look for. The lattice has a spacing `width` [m],
     and its nodes are `offset` spacings before whole numbers of it."""
-    places = np.asarray(x, float) / width + offset
-    d, index = places.shape[1], np.floor(places).astype(np.int64)
-    first, share = index.min(axis=0), places - index
+    scaled = np.asarray(x, float) / width + offset
+    d, index = scaled.shape[1], np.floor(scaled).astype(np.int64)
+    first, share = index.min(axis=0), scaled - index
     index = index - first
     shape = index.max(axis=0) + 2
     if shape.prod() > _MOST_CELLS:
