@@ -9,7 +9,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy import ndimage
 
 from mpmjax.analysis import WorkPrecision, energy_density, name_of, volume_ratio
 from mpmjax.checks import canonical, checked, require, require_between, require_memory
@@ -256,6 +255,8 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
 def _outward(x: np.ndarray, volume: np.ndarray) -> np.ndarray:
     """The outward normals of a body at its particles [-], (p, 3), at x [m]: about 1 long at its surface, 0 in its
     inside. They are the slope of how full the space is, on a lattice of cells as large as the particles."""
+    from scipy import ndimage  # here, since it takes long to import
+
     lower, upper = x.min(axis=0), x.max(axis=0)
     cell = max(float(volume.mean()) ** (1 / 3), float((upper - lower).max()) / _MOST_CELLS)
     place = (x - lower) / cell + 3.5
