@@ -282,7 +282,11 @@ def render(
     path: RunPath,
     output: Annotated[Path, typer.Option("--output", "-o", help="A picture: .png, .pdf, .svg, or .gif of all frames.")],
     colour: Annotated[
-        str, typer.Option(help="What colours the particles: speed, volume, energy, what a law remembers, none.")
+        str,
+        typer.Option(
+            help="What colours the particles: speed, volume, energy, pressure, von_mises, density, none, or what a law "
+            "remembers."
+        ),
     ] = "speed",
     frame: Annotated[int | None, typer.Option(help="The frame of a still; negative from the end.")] = None,
     view: Annotated[

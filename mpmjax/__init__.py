@@ -20,7 +20,7 @@ from mpmjax import (
     state as state,
     stepping as stepping,
 )
-from mpmjax.analysis import budget as budget, energy as energy, momentum as momentum
+from mpmjax.analysis import budget as budget, energy as energy, momentum as momentum, stress as stress
 from mpmjax.boundary import (
     ContactPlane as ContactPlane,
     Grip as Grip,

@@ -211,7 +211,7 @@ def test_an_example_is_copied_with_its_data(tmp_path, monkeypatch):
 
 
 def test_a_scene_is_loaded_as_the_shell_runs_it(folder):
-    """The arguments of `simulate`; in JAX's own precision if the file names none."""
+    """The arguments of `simulate`; in JAX's own precision if the file names none. Its run is read in that too."""
     scene, particles, settings = mpm.load_scene(folder / "scene.toml")
     run = mpm.simulate(scene, particles, **settings)
     recorded = mpm.load(folder / "run.h5")
@@ -221,6 +221,10 @@ def test_a_scene_is_loaded_as_the_shell_runs_it(folder):
         (folder / "double.toml").write_text(SCENE.replace("t1 =", 'precision = "float64"\nt1 ='))
         with pytest.raises(ValueError, match="jax_enable_x64"):
             mpm.load_scene(folder / "double.toml")
+        with pytest.warns(UserWarning, match="read in float32"):
+            rounded = mpm.load(folder / "run.h5")
+        later = mpm.simulate(scene, rounded.final, **settings | {"t1": 0.08}, start=int(rounded.final_step))
+        np.testing.assert_allclose(later.final.x[:, 0], recorded.final.x[:, 0], atol=0.05)
 
 
 def test_run_does_not_replace_a_file_unasked_and_resumes_it(folder):

@@ -114,7 +114,8 @@ def test_files_are_small(name):
 def test_importing_changes_no_configuration_and_computes_nothing():
     """In a fresh interpreter: jax's configuration is as before, and no device has been started."""
     script = """
-import jax, equinox, lineax, diffrax, h5py
+import sys
+import jax, equinox, lineax, diffrax
 from jax._src import xla_bridge
 before = dict(jax.config.values)
 assert not xla_bridge.backends_are_initialized(), "a dependency starts a device"
@@ -122,6 +123,8 @@ import mpmjax
 changed = {k: v for k, v in jax.config.values.items() if before.get(k) != v}
 assert not changed, f"mpmjax changes {changed}"
 assert not xla_bridge.backends_are_initialized(), "mpmjax runs a computation"
+late = {"h5py", "matplotlib", "typer", *(f"scipy.{part}" for part in "linalg ndimage sparse spatial special".split())}
+assert not late & set(sys.modules), f"{late & set(sys.modules)} take long to import, and are for what uses them"
 """
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=PACKAGE.parent)

@@ -804,11 +804,15 @@ def test_what_could_not_be_loaded_is_not_begun(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_float64_runs_ask_for_64_bits(tmp_path):
-    """They are not rounded in silence."""
-    save(tmp_path / "run.h5", made_up(2))
-    with jax.enable_x64(False), pytest.raises(ValueError, match=r"holds a float64 run: call jax\.config\.update"):
-        load(tmp_path / "run.h5")
+def test_float64_runs_are_not_rounded_in_silence(tmp_path):
+    """Without 64-bit mode they are read in float32, with a warning."""
+    run = made_up(2)
+    save(tmp_path / "run.h5", run)
+    with jax.enable_x64(False):
+        with pytest.warns(UserWarning, match=r"holds a float64 run, read in float32: call jax\.config\.update"):
+            rounded = load(tmp_path / "run.h5")
+        assert {leaf.dtype for leaf in jax.tree.leaves(rounded.final)} == {np.dtype("float32")}
+        np.testing.assert_array_equal(rounded.frames.x, np.asarray(run.frames.x, np.float32))
 
 
 def test_a_truncated_file_is_refused(tmp_path):

@@ -49,7 +49,8 @@ KINDS = {
     "Force": 'data = "force.csv"\ntime = "t"\nforce = ["", "fy"]',
     "Torque": 'data = "torque.csv"\ntime = "t"\ntorque = ["mz"]',
     "ForceDisplacement": (
-        'data = "curve.csv"\ndisplacement = "u [mm]"\nforce = "load"\naxis = 1\nlength_unit = 1e-3\nunit = -1.0'
+        'data = "curve.csv"\ndisplacement = "u [mm]"\nforce = "load"\naxis = 1\nlength_unit = 1e-3\n'
+        "length_scale = -1.0\nscale = -2.0"
     ),
     "Energy": 'data = "energy.csv"\ntime = "t"\nvalue = "e"\npart = "elastic"',
     "Cloud": 'data = "cloud.csv"\ntime = "t"\nplace = ["x", "y"]\n' + GRID,
@@ -78,7 +79,7 @@ def pushed(tmp_path_factory):
         (
             "curve",
             ("u [mm]", "load"),
-            [(1e3 * (t - 0.01), -f) for t, f in zip(middles, force[:, 1], strict=True) if t > 0.01],
+            [(-1e3 * (t - 0.01), -f / 2) for t, f in zip(middles, force[:, 1], strict=True) if t > 0.01],
         ),
         ("energy", ("t", "e"), zip(times, energies, strict=True)),
         ("cloud", ("t", "x", "y"), cloud),
@@ -91,7 +92,7 @@ def pushed(tmp_path_factory):
 
 
 def test_each_kind_predicts_what_was_measured_of_the_same_run(pushed):
-    """And nothing else does: none is the same on another run."""
+    """And nothing else does: none is the same on another run. The curve is of half a body, pressed the other way."""
     (experiment,) = read_fit(pushed / "block.toml").experiments
     assert experiment.observations[0].collider == 0
     run = experiment.run()
@@ -153,8 +154,8 @@ BAD = {
         r"cloud\.csv, line 3: t 0\.01 comes after a later one",
     ),
     "outside": ("cloud.csv", "t,x,y\n0.02,0.2,9\n", r"cloud\.csv, line 2: y 9 lies outside of the picture's grid"),
-    "not reached": ("curve.csv", "u [mm],load\n1,2\n90,2\n", r"curve\.csv, line 3: u \[mm\] 90 is not reached"),
-    "back": ("curve.csv", "u [mm],load\n2,2\n1,2\n", r"curve\.csv, line 3: u \[mm\] 1 must go on"),
+    "not reached": ("curve.csv", "u [mm],load\n-1,2\n-90,2\n", r"curve\.csv, line 3: u \[mm\] -90 is not reached"),
+    "back": ("curve.csv", "u [mm],load\n-2,2\n-1,2\n", r"curve\.csv, line 3: u \[mm\] -1 must go on"),
     "no archive": ("pictures.npz", "no archive", r"pictures\.npz"),
 }
 

@@ -1,4 +1,4 @@
-"""Energy and momentum, their budgets, growth of derivatives, error against seconds."""
+"""Energy, momentum, stress, their budgets, growth of derivatives, error against seconds."""
 
 from mpmjax.analysis._bench import Build as Build, Trial as Trial, name_of as name_of
 from mpmjax.analysis._budget import (
@@ -16,6 +16,13 @@ from mpmjax.analysis._budget import (
     volume_ratio as volume_ratio,
 )
 from mpmjax.analysis._sensitivity import Sensitivity as Sensitivity, sensitivity as sensitivity
+from mpmjax.analysis._stress import (
+    density as density,
+    pressure as pressure,
+    smoothed as smoothed,
+    stress as stress,
+    von_mises as von_mises,
+)
 from mpmjax.analysis._work_precision import (
     METHODS as METHODS,
     WorkPrecision as WorkPrecision,

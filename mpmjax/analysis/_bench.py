@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import scipy.spatial
 
 from mpmjax.checks import canonical, require, shape_of
 from mpmjax.simulation import Problem, SimulationError, initial_state, no_steps, raise_faults, run_to, segment
@@ -76,7 +75,9 @@ class Displacements(NamedTuple):
     def distance(self, finer: "Displacements") -> float:
         """The relative error against the motion of as many or more particles, see `_work_precision`."""
         share = max(1, round(len(finer.X) / len(self.X)))
-        near = scipy.spatial.KDTree(finer.X).query(self.X, k=share)[1].reshape(len(self.X), share)
+        from scipy.spatial import KDTree  # here, since it takes long to import
+
+        near = KDTree(finer.X).query(self.X, k=share)[1].reshape(len(self.X), share)
         return float(_rms(self.u - finer.u[:, near].mean(axis=2)).max() / finer.size)
 
 

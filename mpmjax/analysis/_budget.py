@@ -5,7 +5,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse.csgraph
 
 from mpmjax._types import Array, Float, Matrix, NodeVector, ParticleScalar, Scalar, components
 from mpmjax.checks import canonical, checked, require, require_positive, require_whole
@@ -93,6 +92,9 @@ def pieces(scene: Scene, particles: Particles) -> int:
     the end of a run than at its start are a sign of it, unless the material was meant to part. `TotalLagrangian` and
     more particles a cell prevent it.
     """
+    from scipy import sparse  # here, since they take long to import
+    from scipy.sparse import csgraph
+
     scene = canonical(scene, particles.x.dtype)
     stencil = scene.stencil(prepare(scene, particles))
     touching = np.asarray(stencil.weight) > 0
@@ -100,7 +102,7 @@ def pieces(scene: Scene, particles: Particles) -> int:
     _, node = np.unique(np.asarray(stencil.index)[touching], return_inverse=True)
     size = particles.count + int(node.max()) + 1
     edges = (np.ones(node.size, bool), (particle, particles.count + node))
-    return scipy.sparse.csgraph.connected_components(scipy.sparse.coo_array(edges, (size, size)), directed=False)[0]
+    return csgraph.connected_components(sparse.coo_array(edges, (size, size)), directed=False)[0]
 
 
 class EnergyBudget(eqx.Module):

@@ -1,4 +1,4 @@
-"""What the shell's commands do, which `mpmjax_command` reads: run, check, fit, chart, and say what a file holds."""
+"""The shell's commands, after `mpmjax_command` has read their options: run, check, fit, chart, describe."""
 
 import signal
 import sys
@@ -299,7 +299,7 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
 
 
 def describe_run(path: Path) -> str:
-    """What a run's file holds."""
+    """A run's file in words."""
     run = load(path)
     lines = {
         "file": f"{path}, {_bytes(path.stat().st_size)}, {run.final.x.dtype}",

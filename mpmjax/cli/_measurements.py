@@ -43,6 +43,7 @@ class Measurement:
     folder: Path  # where the scene file lies
     data: str
     unit: Scalar = 1.0
+    scale: Scalar = 1.0  # factor beside the unit: -1 turns a direction, 2 makes a whole of what half a model feels
     time: str
     time_unit: Scalar = 1.0
     length_unit: Scalar = 1.0
@@ -61,16 +62,16 @@ class Measurement:
         name = name if self.name is None else self.name
         return {"sigma": self.sigma, "weight": self.weight, "robust": self.robust, "name": name}
 
-    def columns(self, *names: str, sign: bool = False) -> Columns:
-        """Columns of the CSV file, after a look at the units; with `sign` the first may be negative, to turn a
-        direction."""
-        self.check_units(sign=sign)
+    def columns(self, *names: str) -> Columns:
+        """Columns of the CSV file, after a look at the units."""
+        self.check_units()
         require(len(set(names)) == len(names), f"{_HEADER} names a column twice: {', '.join(names)}.")
         return Columns(self.folder / self.data, *names)
 
-    def check_units(self, other: str = "time_unit or length_unit", *, sign: bool = False) -> None:
-        """Check that the units are positive."""
-        require_positive(f"{_HEADER} unit", abs(self.unit) if sign else self.unit)
+    def check_units(self, other: str = "time_unit or length_unit") -> None:
+        """Check that the units are positive, and that no factor is zero."""
+        require_positive(f"{_HEADER} scale = -1 turns a direction; unit", self.unit)
+        require(self.scale != 0 and np.isfinite(self.scale), f"{_HEADER} scale must not be zero, got {self.scale}.")
         require_positive(f"{_HEADER} {other}", self.time_unit * self.length_unit)
 
     def times(self, columns: Columns, *, grow: bool = True) -> np.ndarray:
@@ -78,8 +79,8 @@ class Measurement:
         return columns.times(self.time, float(self.time_unit), self.simulation.t1, grow=grow)
 
     def scaled(self, columns: Columns, name: str) -> np.ndarray:
-        """A column in SI units."""
-        return columns.scaled(name, float(self.unit))
+        """A column in SI units, by its factor."""
+        return columns.scaled(name, float(self.unit)) * float(self.scale)
 
     def places(self, place: tuple[str, ...], *others: str, grid: Grid | None = None) -> tuple[Columns, np.ndarray]:
         """The columns, and the places in them [m], shape (rows, d)."""
@@ -94,7 +95,7 @@ class Measurement:
     def components(self, names: tuple[str, ...], count: int) -> tuple[np.ndarray, np.ndarray]:
         """Times, and components in columns, "" for one that was not measured."""
         require(len(names) == count and any(names), f'{_HEADER} needs {count} columns, "" for none, got {names}.')
-        columns = self.columns(self.time, *(name for name in names if name), sign=True)
+        columns = self.columns(self.time, *(name for name in names if name))
         t = self.times(columns)
         blank = np.full(len(t), np.nan)
         return t, np.stack([self.scaled(columns, name) if name else blank for name in names], axis=1)
@@ -230,7 +231,14 @@ def _torque(m: Measurement, *, torque: tuple[str, ...], collider: int = 0, bound
 
 @_kind("ForceDisplacement", without=("time", "time_unit"))
 def _force_displacement(
-    m: Measurement, *, displacement: str, force: str, axis: int, collider: int = 0, boundary: int | None = None
+    m: Measurement,
+    *,
+    displacement: str,
+    length_scale: Scalar = 1.0,
+    force: str,
+    axis: int,
+    collider: int = 0,
+    boundary: int | None = None,
 ) -> Force:
     what, number, bodies = "collider", collider, [b for b in m.simulation.scene.boundary if b.collider_count]
     if boundary is not None:
@@ -239,7 +247,7 @@ def _force_displacement(
     require(0 <= number < len(bodies), f"{_HEADER} {what} must be from 0 to {len(bodies) - 1}, got {number}.")
     motion: Any = getattr(bodies[number], "motion", None)
     require(motion is not None, f"{_HEADER} ForceDisplacement needs a {what} that moves, but {number} is at rest.")
-    columns = m.columns(displacement, force, sign=True)
+    columns = m.columns(displacement, force)
     times, path = np.asarray(motion.times, float), np.asarray(motion.displacement, float)[:, axis]
     last, t1 = np.searchsorted(times, m.simulation.t1), m.simulation.t1
     times, path = np.append(times[:last], t1), np.append(path[:last], np.interp(t1, times, path))
@@ -247,7 +255,7 @@ def _force_displacement(
     grows = way * np.diff(path)
     moves = np.append(grows > 0, True) | np.append(False, grows > 0)
     require((grows >= 0).all() and way != 0, f"{_HEADER} the {what} must move one way along axis {axis}.")
-    x = columns.scaled(displacement, float(m.length_unit), "length_unit")
+    x = columns.scaled(displacement, float(m.length_unit), "length_unit") * float(length_scale)
     columns.require(
         (way * x >= way * path[0]) & (way * x <= way * path[-1] * (1 + 1e-9)),
         f"{displacement} {{{displacement}}} is not reached: the {what} moves from {path[0]:g} to {path[-1]:g} m.",
@@ -282,7 +290,7 @@ def _density(m: Measurement, *, grid: Grid, time: str = "times", value: str = "d
     path = m.folder / m.data
     m.check_units("time_unit")
     t, pictures = read_arrays(path, time, value)
-    t, pictures = t * float(m.time_unit), pictures * float(m.unit)
+    t, pictures = t * float(m.time_unit), pictures * float(m.unit) * float(m.scale)
     shape = tuple(int(n) for n in grid.shape)
     require(
         t.ndim == 1 and len(t) > 0 and pictures.shape == (len(t), *shape),

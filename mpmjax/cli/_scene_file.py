@@ -76,7 +76,7 @@ class Simulation(NamedTuple):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What `simulate` and `record` take beside scene and particles."""
+        """The arguments of `simulate` and `record` beside scene and particles."""
         return {"t1": self.t1, "dt": self.dt, "method": self.method, "save_every": self.save_every}
 
 

@@ -6,7 +6,6 @@ import re
 import zipfile
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from mpmjax.checks import require, shortened
@@ -149,6 +148,8 @@ def read_arrays(path: Path, *names: str) -> list[np.ndarray]:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in names if name in file}
         else:
+            import h5py  # here, since it takes long to import
+
             with h5py.File(path, "r", locking=False) as file:
                 arrays = {name: np.asarray(file[name]) for name in names if name in file}
     except (OSError, KeyError, EOFError, ValueError, TypeError, MemoryError, zipfile.BadZipFile) as error:

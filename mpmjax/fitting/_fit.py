@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import chdtrc
 
 from mpmjax._types import Scalar
 from mpmjax.checks import checked, require, warn
@@ -240,6 +239,8 @@ class EnsembleFit(eqx.Module):
         z, s = np.where(ratio, np.log(np.where(ratio, z, 1)), z), s / np.where(ratio, z, 1)
         weight = 1 / s**2
         mean = (weight * z).sum(axis=0) / weight.sum(axis=0)
+        from scipy.special import chdtrc  # here, since it takes long to import
+
         return np.asarray(chdtrc(len(z) - 1, (weight * (z - mean) ** 2).sum(axis=0)))
 
     @property

@@ -22,7 +22,6 @@ from types import CodeType
 from typing import Any
 
 import equinox as eqx
-import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,6 +67,8 @@ def recorded(
 
             def write(last: Search | None) -> None:
                 """Write the file; if the disk refuses, the log is what it was."""
+                import h5py  # here, since it takes long to import
+
                 whole = io.BytesIO()
                 with h5py.File(whole, "w", libver=("v110", "v110")) as contents:
                     attributes = {"kind": np.bytes_("mpmjax fit log"), "version": np.bytes_(version("mpmjax"))}
@@ -126,6 +127,8 @@ def recorded(
 def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: dict[str, str]) -> tuple[Any, ...]:
     """The iterations in a log as rows, coordinates and values, the noise of its rounds, and the past of the fit. It
     must be whole and of the same fit."""
+    import h5py
+
     damaged = f"{path} is damaged ({{}}): begin the fit anew with another log."
     try:
         data = path.read_bytes()

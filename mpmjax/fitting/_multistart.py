@@ -1,5 +1,6 @@
 """Fits from many starting points, and the minima that they lead to."""
 
+import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,8 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.distance import cdist
-from scipy.special import gammaln, ndtr, ndtri
 
 from mpmjax._types import Array, Float, Int, Scalar
 from mpmjax.checks import checked, require, require_between, require_finite, require_whole, warn
@@ -283,6 +282,8 @@ def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], range
             ends = (parameter.value(jnp.asarray(first), jnp.full(first.shape, side)) for side in (-1.0, 1.0))
             lower, upper = (np.asarray(end) for end in ends)
         if limits is None and prior is not None:
+            from scipy.special import ndtr, ndtri  # here, since it takes long to import
+
             mean, sigma = prior
             below, above = ndtr((lowest - mean) / sigma), ndtr((highest - mean) / sigma)
             values = mean + sigma * ndtri(below + share * (above - below))
@@ -319,7 +320,7 @@ def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], frac
     near = critical_distance(count, size)
     for place, k in enumerate(order):
         better = order[:place]
-        distances = cdist(shares[k : k + 1], shares[better])[0]
+        distances = np.linalg.norm(shares[better] - shares[k], axis=1)
         alone = place < fraction * count or (distances > near).all()
         stands[k] = k if alone else stands[better[distances.argmin()]]
     return stands
@@ -329,7 +330,7 @@ def critical_distance(count: int, size: int) -> float:
     """The radius of a ball in which σ ln k of k points of the unit cube of n dimensions lie, but for its boundary."""
     if count < 2:
         return 0.0
-    logarithm = gammaln(1 + size / 2) + np.log(_SIGMA * np.log(count) / count)
+    logarithm = math.lgamma(1 + size / 2) + np.log(_SIGMA * np.log(count) / count)
     return float(np.exp(logarithm / size) / np.sqrt(np.pi))
 
 

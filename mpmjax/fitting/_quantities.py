@@ -5,7 +5,6 @@ from typing import Any, Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import KDTree
 
 from mpmjax._types import Array, Float, ParticleScalar, ParticleVector, Scalar
 from mpmjax.checks import canonical, checked, is_traced, require, require_fields
@@ -62,6 +61,8 @@ class Markers(eqx.Module):
         )
         k = min(_NEIGHBOURS**d, particles.count)
         require(k > d, f"Markers between particles need more than {d} of them, got {particles.count}.")
+        from scipy.spatial import KDTree  # here, since it takes long to import
+
         nearest = np.asarray(KDTree(x).query(places, k)[1])
         arms = x[nearest] - places[:, None]
         far = np.sqrt((arms**2).sum(axis=-1).max(axis=1, keepdims=True))

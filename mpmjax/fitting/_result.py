@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import chdtrc
 
 from mpmjax._types import Array
 from mpmjax.checks import require
@@ -148,6 +147,8 @@ class FitResult(AbstractFit):
         plain = all(o.trust == (1.0, None) for e in self.experiments for o in e.observations)
         if not plain or any(noise.estimated for noise in self.noise) or self.degrees_of_freedom < 1:
             return np.nan
+        from scipy.special import chdtrc  # here, since it takes long to import
+
         return float(chdtrc(self.degrees_of_freedom, self.chi_squared))
 
     def __str__(self) -> str:

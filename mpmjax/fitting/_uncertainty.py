@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import qr
-from scipy.special import ndtri, stdtrit
 
 _ROUNDINGS = 1e3
 """Singular values of J, its columns of length one, below this many roundings of the largest are none: the data do not
@@ -101,6 +99,8 @@ def quantile(level: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray
     """How many standard errors an interval of this level reaches to each side: of Student's t, or with infinite degrees
     of freedom of the normal distribution."""
     p, normal = (1 + level) / 2, np.isinf(degrees_of_freedom)
+    from scipy.special import ndtri, stdtrit  # here, since it takes long to import
+
     return np.where(normal, ndtri(p), stdtrit(np.where(normal, 1, degrees_of_freedom), p))
 
 
@@ -163,6 +163,8 @@ def seen_together(labels: tuple[str, ...], errors: Uncertainty, logarithmic: tup
     for columns, weak in ((errors.unseen, False), (errors.weak, True)):
         effects = columns * length[:, None]  # on the data
         if effects.shape[1] > 1:
+            from scipy.linalg import qr  # here, since it takes long to import
+
             # Combinations, each with a coordinate to itself, so that few coordinates meet in one.
             *_, pivots = qr(effects.T, mode="r", pivoting=True)
             effects = effects @ np.linalg.inv(effects[pivots[: effects.shape[1]]])

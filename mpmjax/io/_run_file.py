@@ -11,14 +11,13 @@ dataset carries checksums, and a chunk holds one frame, so that writing a frame 
 import json
 import struct
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import reduce
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import h5py
 import jax
 import numpy as np
 
@@ -31,8 +30,8 @@ from mpmjax.stepping import AbstractIntegrator
 
 File = Any  # an `h5py.File`, whose own annotations do not say what a name leads to
 FORMAT = 9
-_LIBVER_HEAD = ("v108", "v108")
-_LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
+_LIBVER_HEAD, _LIBVER = ("v108", "v108"), ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
+_GROUPS = ("VTKHDF", "mpmjax")
 _GROWING = (
     "VTKHDF/Points",
     "VTKHDF/PointData/",
@@ -42,7 +41,6 @@ _GROWING = (
     "mpmjax/boundary_impulse",
     "mpmjax/checksums",
 )
-_GROUPS = ("VTKHDF", "mpmjax")
 _MOST_SHRUNK = 1032  # the most that deflate shrinks data by: h5repack may have compressed a run
 _UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
 _UNCHANGING = ("mass", "volume", "X")
@@ -79,11 +77,11 @@ def check_place(path: Path, *, overwrite: bool) -> None:
     require(path.is_file(), f"{path} is not a file: choose another name.")
     require_no_writer(path)  # first: what is just being written may not be a whole run to look at
     if path.stat().st_size > 0:
-        try:
-            with h5py.File(path, "r", locking=False) as file:
-                run = all(_is_own(file, name) for name in _GROUPS)
-        except OSError:
-            run = False
+        import h5py  # here, since it takes long to import
+
+        run = False
+        with suppress(OSError), h5py.File(path, "r", locking=False) as file:
+            run = all(_is_own(file, name) for name in _GROUPS)
         require(run, f"{path} is not a run that mpmjax wrote, and is not replaced: choose another name, or remove it.")
 
 
@@ -103,6 +101,8 @@ def check_hdf5(path: Path) -> None:
 @contextmanager
 def reading(path: Path) -> Iterator[File]:
     """Open a file to be read; every error of HDF5 becomes one line that says what to do."""
+    import h5py
+
     check_hdf5(path)
     try:
         with h5py.File(path, "r", locking=False) as file:
@@ -118,14 +118,13 @@ def reading(path: Path) -> Iterator[File]:
         with open(path, "rb") as raw:
             head = raw.read(36)  # the superblock, which from HDF5 1.8 on says how long the file is
         stated = struct.unpack_from("<Q", head, 28)[0] if len(head) == 36 and head[8] in (2, 3) else 0
-        short = len(head) < 36 or path.stat().st_size < stated
-        what = "is cut short" if short else "is damaged, or just being written"
+        what = "is cut short" if len(head) < 36 or path.stat().st_size < stated else "is damaged, or just being written"
         raise ValueError(f"{path} {what} ({reason(error)}): {_REMEDY}.") from None
 
 
 def _is_own(group: File, name: str) -> bool:
     """Whether a name stands for an object itself, not for a link to an object in this or another file."""
-    return isinstance(group.get(name, getlink=True), h5py.HardLink)
+    return type(group.get(name, getlink=True)).__name__ == "HardLink"
 
 
 def _check(path: Path, file: File) -> None:
@@ -141,12 +140,12 @@ def _check(path: Path, file: File) -> None:
                 fault = "is a link"
             elif item in seen:
                 fault = "is a second name of an object"
-            elif isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
+            elif not isinstance(item, Mapping) and (item.is_virtual or item.external):
                 fault = "has its data in other files"
-            where = f"{path}: {group.name.rstrip('/')}/{name}"
-            require_of_file(fault is None, f"{where} {fault}, which no run of mpmjax has: {_REMEDY}.")
+            place = f"{path}: {group.name.rstrip('/')}/{name} {fault}"
+            require_of_file(fault is None, f"{place}, which no run of mpmjax has: {_REMEDY}.")
             seen.add(item)
-            todo += [item] if isinstance(item, h5py.Group) else []
+            todo += [item] if isinstance(item, Mapping) else []
     version = int(file["mpmjax"].attrs["format"])
     require_of_file(
         version == FORMAT,
@@ -181,7 +180,7 @@ def _datasets(file: File, *, growing: bool) -> dict[str, Any]:
     datasets: dict[str, Any] = {}
 
     def add(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and name.startswith(_GROWING) == growing:
+        if not isinstance(item, Mapping) and name.startswith(_GROWING) == growing:
             datasets[name] = item
 
     file.visititems(add)
@@ -207,9 +206,13 @@ def frame_rows(file: File, start: int, stop: int) -> dict[str, np.ndarray]:
     return rows
 
 
-def opened(staged: StagedFile, path: Path) -> File:
+def opened(staged: StagedFile, path: Path, *, new: bool = False) -> File:
     """The staged file as HDF5. Its head has been written with the superblock of HDF5 1.8: a later one says whether a
     writer is at work, and while it is, and for ever if it was killed, nobody could open the file."""
+    import h5py
+
+    if new:
+        h5py.File(staged, "w", libver=_LIBVER_HEAD).close()
     try:
         return h5py.File(staged, "r+", libver=_LIBVER)
     except OSError as error:
@@ -225,8 +228,7 @@ def created(staged: StagedFile, path: Path, described: dict[str, Any], rows: dic
         decode(described["method"], AbstractIntegrator, "method", arrays)
     except ValueError as error:
         raise FileRefusedError(f"{path} could not be loaded again, as {dtype} rounds it: {error}") from None
-    h5py.File(staged, "w", libver=_LIBVER_HEAD).close()
-    file = opened(staged, path)
+    file = opened(staged, path, new=True)
 
     def fix(group: File, name: str, data: Any) -> None:
         data = np.asarray(data)
@@ -369,12 +371,11 @@ def check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> None
     """Check that the run to be continued is the one in the file."""
     mine, other = dict(_flat(ours)), dict(_flat(theirs))
     for name in (*other, *mine):
-        pair: Any = mine.get(name), other.get(name)
-        a, b = pair
+        a, b = mine.get(name), other.get(name)
         show = "another array" if isinstance(b, np.ndarray) else "none" if b is None else repr(b)
         got = "" if isinstance(a, np.ndarray) else f" instead of {a!r}"
         require_of_file(
-            type(a) is type(b) and np.array_equal(*pair),
+            type(a) is type(b) and np.array_equal(*cast(Any, (a, b))),
             f"{path} holds another run: its {name} is {show}{got}. Resume the same run, or name a new file.",
         )
 

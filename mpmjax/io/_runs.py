@@ -32,7 +32,7 @@ from tqdm import tqdm
 
 from mpmjax._types import Scalar
 from mpmjax.boundary import Impulses
-from mpmjax.checks import canonical, checked, is_traced, require, require_memory, require_whole, requirements
+from mpmjax.checks import canonical, checked, is_traced, require, require_memory, require_whole, requirements, warn
 from mpmjax.io._run_file import (
     File,
     check_hdf5,
@@ -331,20 +331,20 @@ def save(path: str | os.PathLike, run: Run) -> None:
 @checked
 def load(path: str | os.PathLike) -> Run:
     """The run in a file, bit for bit: scene, method, dt, frames, statistics; `final` is the last frame.
+    Unless jax's 64-bit mode is on, a float64 run is rounded to float32, with a warning.
 
     Raises:
         ValueError: a file that is missing, cut short or damaged, not of this package or of another format, without
-            frames; or a float64 run while jax's 64-bit mode is off.
+            frames.
     """
     path = Path(path)
     with reading(path) as file:
         described = description_in(file["mpmjax"])
         dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
         require(dtype.kind == "f", f"its numbers are of {dtype}")
-        require_of_file(
-            dtype.itemsize <= jnp.zeros(()).dtype.itemsize,
-            f'{path} holds a {dtype} run: call jax.config.update("jax_enable_x64", True) first.',
-        )
+        if dtype.itemsize > (most := jnp.zeros(()).dtype).itemsize:
+            warn(f'{path} holds a {dtype} run, read in {most}: call jax.config.update("jax_enable_x64", True) before.')
+            dtype = most
         require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
         require_memory(f"The run in {path}", path.stat().st_size, "read a part of it by h5py.")
         scene = decode(described["scene"], Scene, "scene", arrays)

@@ -46,6 +46,14 @@ class Hencky(AbstractIsotropic):
             squares = squares + _missing(F) * self.transverse_strain**2
         return self.shear_modulus * squares + self.lame_lambda / 2 * self._dilation(la.trace(strain), F) ** 2
 
+    def in_space(self, F: Matrix) -> tuple["Hencky", Matrix]:
+        """With the stretches exp ε_t."""
+        law, whole = Hencky(self.youngs_modulus, self.poisson_ratio), super().in_space(F)[1]
+        if self.transverse_strain is not None:
+            for i in range(len(F), 3):
+                whole = whole.at[i, i].set(jnp.exp(self.transverse_strain))
+        return law, whole
+
     def stress(self, F: Matrix) -> Matrix:
         strain = logarithmic_strain(F)
         dilation = self._dilation(la.trace(strain), F)

@@ -212,6 +212,14 @@ class AbstractMaterial(AbstractLaw):
     def energy(self, F: Deformation, /) -> Array:
         """Ψ [J/m³ of undeformed volume], shape (p,)."""
 
+    def in_space(self, F: Deformation, /) -> tuple["AbstractMaterial", Deformation]:
+        """The law and the deformation in three dimensions, (3, 3, p), of which F is the part in the plane or along the
+        line. Default: the other stretches are 1. A law of J is in space as it is."""
+        if not self.measure.axes:
+            return self, F
+        d, whole = len(F), jnp.broadcast_to(jnp.eye(3, dtype=F.dtype)[..., None], (3, 3, *F.shape[2:]))
+        return self, whole.at[:d, :d].set(F)
+
     def stress(self, F: Deformation, /) -> Deformation:
         """The energy's derivative by the deformation [Pa], of its shape: the first Piola-Kirchhoff stress P = ∂Ψ/∂F, or
         dΨ/dJ, minus the pressure. Default: the energy's gradient."""

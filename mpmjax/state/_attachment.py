@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import KDTree
 
 from mpmjax._types import Array, Float, Int, Matrix, NodeVector, Scalar
 from mpmjax.checks import is_traced, require, require_fields, require_positive, require_that, shape_of, warn
@@ -194,6 +193,8 @@ def _positions(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, 
 
 def _nearest(x: np.ndarray, positions: np.ndarray, apart: float, place: AbstractPlace) -> np.ndarray:
     """The number of the particle nearest to each position."""
+    from scipy.spatial import KDTree  # here, since it takes long to import
+
     far, particle = KDTree(x).query(positions)
     require(
         far <= _FAR * apart,

@@ -9,9 +9,8 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy import ndimage
 
-from mpmjax.analysis import WorkPrecision, energy_density, name_of, volume_ratio
+from mpmjax.analysis import WorkPrecision, density, energy_density, name_of, pressure, smoothed, volume_ratio, von_mises
 from mpmjax.checks import canonical, checked, require, require_between, require_memory
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
@@ -21,6 +20,9 @@ COLOURS: dict[str, tuple[str, Callable[[Run, Particles], Any]]] = {
     "speed": ("speed [m/s]", lambda run, q: np.linalg.norm(q.v, axis=1)),
     "volume": ("volume ratio J [-]", lambda run, q: volume_ratio(q)),
     "energy": ("elastic energy density [J/m³]", lambda run, q: energy_density(run.scene, q)),
+    "pressure": ("pressure [Pa]", lambda run, q: smoothed(run.scene, q, pressure(run.scene, q))),
+    "von_mises": ("von Mises stress [Pa]", lambda run, q: smoothed(run.scene, q, von_mises(run.scene, q))),
+    "density": ("density [kg/m^d]", lambda run, q: density(run.scene, q)),
 }
 """The quantities that can colour particles: a label, and a value for each particle."""
 
@@ -52,8 +54,9 @@ def render(
     Args:
         run: a run with frames.
         path: the picture to write; its suffix says of which kind.
-        colour: "speed", "volume", "energy", or the name of what a law remembers, such as snow's "plastic_volume"; None
-            or "none" to see the shape alone, each material in a colour of its own.
+        colour: "speed", "volume", "energy", "pressure", "von_mises", "density", or the name of what a law remembers,
+            such as snow's "plastic_volume"; None or "none" to see the shape alone, materials in colours of their own.
+            Pressure and von Mises stress are averages over the particles around (`analysis.smoothed`).
         frame: which frame a still shows; counts from the end if negative. Default: the last.
         view: in three dimensions, azimuth and elevation of the eye [degrees]. At azimuth 0 the first horizontal axis
             points to the right; the elevation is above 0 and at most 90.
@@ -256,6 +259,8 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
 def _outward(x: np.ndarray, volume: np.ndarray) -> np.ndarray:
     """The outward normals of a body at its particles [-], (p, 3), at x [m]: about 1 long at its surface, 0 in its
     inside. They are the slope of how full the space is, on a lattice of cells as large as the particles."""
+    from scipy import ndimage  # here, since it takes long to import
+
     lower, upper = x.min(axis=0), x.max(axis=0)
     cell = max(float(volume.mean()) ** (1 / 3), float((upper - lower).max()) / _MOST_CELLS)
     place = (x - lower) / cell + 3.5

@@ -1,0 +1,80 @@
+"""Stress and density of particles, and the numbers that are plotted of them."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax import linalg as la
+from mpmjax._types import Array, Float, ParticleScalar, components
+from mpmjax.checks import canonical, checked
+from mpmjax.discretisation import gather, scatter
+from mpmjax.state import Particles, Scene, prepare, velocity_gradient
+
+
+@checked
+def stress(scene: Scene, particles: Particles) -> Float[Array, "p 3 3"]:
+    """The Cauchy stress σ of each particle [Pa], tension positive, shape (p, 3, 3).
+
+    σ = P Fᵀ/J + σ_v, of the elastic law for the present history, with the viscous stress where a law has one. Two
+    dimensions are plane strain and one is uniaxial strain, in which there are stresses normal to the plane or the line
+    too. With averaged volumes it is the stress at F̄ (see `AveragedVolume`). It is differentiable by all floats.
+
+    *When it breaks*: of material that yielding has loosened or torn, J counts the volume without its gaps. Stresses
+    oscillate from particle to particle, by about as much as they are; `analysis.smoothed` averages them.
+    """
+    return _stress_and_ratio(canonical(scene, particles.x.dtype), particles)[0]
+
+
+@checked
+def pressure(scene: Scene, particles: Particles) -> ParticleScalar:
+    """The pressure −tr σ/3 of each particle [Pa], compression positive, shape (p,) (see `stress`)."""
+    return -jnp.trace(stress(scene, particles), axis1=1, axis2=2) / 3
+
+
+@checked
+def von_mises(scene: Scene, particles: Particles) -> ParticleScalar:
+    """The von Mises stress √(3/2 ‖dev σ‖²) of each particle [Pa], shape (p,) (see `stress`)."""
+    sigma = stress(scene, particles)
+    s = sigma - jnp.trace(sigma, axis1=1, axis2=2)[:, None, None] / 3 * jnp.eye(3, dtype=sigma.dtype)
+    square = 1.5 * (s**2).sum(axis=(1, 2))
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)  # the root has no slope at zero
+
+
+@checked
+def density(scene: Scene, particles: Particles) -> ParticleScalar:
+    """The density m/(V0 J) of each particle [kg/m^d], shape (p,), of material without its gaps (see `stress`)."""
+    ratio = _stress_and_ratio(canonical(scene, particles.x.dtype), particles)[1]
+    return particles.mass / (particles.volume * ratio)
+
+
+@checked
+def smoothed(scene: Scene, particles: Particles, values: ParticleScalar) -> ParticleScalar:
+    """Averages of values over the particles around each one, shape (p,), for pictures: the values at the nodes,
+    Σ_p w_ip V0_p f_p / Σ_p w_ip V0_p, interpolated back by the scene's kernel."""
+    scene = canonical(scene, particles.x.dtype)
+    stencil = scene.stencil(prepare(scene, particles))
+    volume = particles.volume
+    sums = scatter(stencil, jnp.stack([volume * values, volume]), None, scene.grid.size)
+    filled = sums[:, 1] > 0
+    nodes = jnp.where(filled, sums[:, 0] / jnp.where(filled, sums[:, 1], 1), 0)
+    return gather(stencil, nodes[:, None])[0][0]
+
+
+@eqx.filter_jit
+def _stress_and_ratio(scene: Scene, particles: Particles) -> tuple[Float[Array, "p 3 3"], ParticleScalar]:
+    """σ [Pa] and J [-] of each particle."""
+    particles = prepare(scene, particles)
+    stresses, ratios = [], []
+    for points, law, group in zip(scene.material_points(particles), scene.laws, particles.groups, strict=True):
+        elastic, F = points.law.in_space(points.strained(points.deformation))
+        J = elastic.measure.determinant(F) * law.compaction(group.history)
+        sigma = elastic.measure.kirchhoff_stress(elastic.stress(F), F, 3) / J
+        if points.viscosity is not None:
+            C = particles.C if particles.C is not None else velocity_gradient(scene, particles)
+            L = points.rows_of(components(C))
+            if scene.total:
+                L = la.matmul(L, la.transpose(la.cofactor(points.deformation)) / la.determinant(points.deformation))
+            missing = (0, 3 - particles.dim)
+            sigma = sigma + points.viscosity.stress(jnp.pad(L, (missing, missing, (0, 0))))
+        stresses.append(sigma)
+        ratios.append(jnp.broadcast_to(J, points.volume.shape))
+    return jnp.moveaxis(jnp.concatenate(stresses, axis=-1), -1, 0), jnp.concatenate(ratios)
