@@ -21,7 +21,6 @@ from mpmjax.fitting import (
     FitProblem,
     Profile,
     fit,
-    fit_multistart,
     fit_refined,
     fit_staged,
     predict_observations,
@@ -29,7 +28,7 @@ from mpmjax.fitting import (
 )
 from mpmjax.io import check_place, load, record, reporting, steps_in, stopping
 from mpmjax.native import backend
-from mpmjax.simulation import Run, initial_state, no_steps, run_to
+from mpmjax.simulation import Problem, Run, initial_state, no_steps, run_to
 from mpmjax.state import Particles
 from mpmjax.stepping import Explicit, stable_dt, step
 from mpmjax.viz import draw_chart, draw_fit, render, write_fit, write_trials
@@ -152,7 +151,7 @@ def fit_scene(
     unknown = [name for name in profiles if name not in labels]
     require(not unknown, f"--profile names {unknown[:1]}, but what is fitted is {', '.join(labels)}.")
     common: dict[str, Any] = {"report": asked.report, "level": asked.level, "optimiser": asked.optimiser}
-    common |= {"log": log, "resume": resume}
+    common |= {"log": log, "resume": resume, "starts": asked.starts}
     with stopping("The fit ends after the iteration in progress; a second signal ends it at once.") as stop:
 
         def progress(line: str) -> None:
@@ -190,28 +189,23 @@ def fit_scene(
 
 
 def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> FitFile:
-    """The fit, started where many searches or a fit to growing horizons ended, if the file asks for these, to the data
-    that the horizons reach."""
-    common: dict[str, Any] = {"level": asked.level, "progress": progress, "optimiser": asked.optimiser}
-    if asked.starts > 1:
-        look = {"starts": asked.starts, "fraction": asked.fraction}
-        many = fit_multistart(asked.experiments, asked.parameters, **look, **common)
-        print(many)
-        return asked._replace(parameters=many.best.restarted(asked.parameters))
+    """The fit, started where a fit to growing horizons ended, if the file asks for these, to the data that they
+    reach."""
     if not asked.horizons:
         return asked
     times = None if asked.horizons is True else asked.horizons
+    common: dict[str, Any] = {"level": asked.level, "progress": progress, "optimiser": asked.optimiser}
     staged = fit_staged(asked.experiments, asked.parameters, horizons=times, **common)
     print(staged)
 
     def until(experiments: tuple[Experiment, ...]) -> tuple[Experiment, ...]:
-        return tuple(e.until(end) for e, end in zip(experiments, staged.horizons, strict=True))
+        return tuple(e.until(fitted.t1) for e, fitted in zip(experiments, staged.experiments, strict=True))
 
     def refined(n: int) -> tuple[tuple[Experiment, ...], tuple[Experiment, ...]]:
         fitted, whole = asked.refined(n)
         return until(fitted), whole
 
-    parameters = staged.result.restarted(asked.parameters)
+    parameters = staged.restarted(asked.parameters)
     return asked._replace(parameters=parameters, experiments=until(asked.experiments), refined=refined)
 
 
@@ -292,8 +286,8 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
     if plot is not None:
         frames = jax.tree.map(lambda a: a[None], state.particles)
         zero = jnp.zeros(1, particles.x.dtype)
-        statistics = no_steps(particles.x.dtype)
-        shown = run_to(state, 0, statistics, scene, particles, zero[0], Explicit(), steps=zero, frames=frames)
+        problem = Problem(scene, particles, zero[0], Explicit())
+        shown = run_to(problem, state, 0, no_steps(particles.x.dtype), steps=zero, frames=frames)
         render(shown, plot, colour=None)
         say("written", str(plot))
 

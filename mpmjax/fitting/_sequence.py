@@ -3,9 +3,10 @@
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,38 +19,11 @@ from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import chosen_optimiser, fit, require_derivative
 from mpmjax.fitting._observation import Series
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem
-from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, NoiseEstimate, restarted, table, table_of_minima
+from mpmjax.fitting._problem import Coordinates, FitProblem, table
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, NoiseEstimate, restarted
 from mpmjax.fitting._search import AbstractOptimiser, begin, iterate, jacobian, search
+from mpmjax.fitting._starts import Starts, as_starts
 from mpmjax.fitting._uncertainty import quantile
-
-
-class Stage(NamedTuple):
-    """A search with the data until one time."""
-
-    horizon: float  # the time [s]
-    values: dict[str, np.ndarray]  # the value of each parameter at its minimum, in its shape
-    misfit: float  # root mean square of the residuals, in units of σ, or of the size of the data where σ is not given
-    iterations: int
-
-
-class StagedFit(AbstractFit):
-    """A fit that came about in stages; `result["E"]` is the estimate of a parameter by the last stage."""
-
-    stages: tuple[Stage, ...]  # the searches before the last, with growing horizons
-    result: FitResult  # the last fit, with its errors
-    horizons: tuple[float, ...]  # until when the data of each experiment were used in the last fit [s]
-    remarks: tuple[str, ...]  # how the horizons were chosen, in words
-
-    @property
-    def all(self) -> tuple[Estimate, ...]:
-        return self.result.all
-
-    def __str__(self) -> str:
-        """The remarks, a table of the stages, then that of the last fit."""
-        cells = [(f"{s.horizon:>24.4g}",) for s in self.stages]
-        rows = table_of_minima((f"{'until [s]':>24}",), cells, self.stages, self.result.problem.labels)
-        return "\n".join([*self.remarks, "", *rows, "", str(self.result)])
 
 
 @checked
@@ -63,13 +37,13 @@ def fit_staged(
     level: Scalar = 0.95,
     optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
-) -> StagedFit:
+) -> FitResult:
     """Fit to the data until a first time, then until later ones, each from where the last search ended.
 
     For motions that repeat or that contacts decide, of which a fit to all data ends in a false minimum.
 
         result = mpm.fitting.fit_staged(swing, {"E": ...})
-        print(result)  # how the horizons were chosen, the stages, the estimate
+        print(result)  # how the horizons were chosen, the stages (`result.remarks`), the estimate
 
     *The first horizon*, where `horizons` does not give it, is the last time until which a change of one in any
     coordinate changes the data by no more than they change themselves, √Σ (∂y/∂z)² ≤ √Σ (y − y(0))², by the derivative
@@ -121,7 +95,6 @@ def fit_staged(
             else "One stage suffices: until the end of the data a change of one in a coordinate changes them by no "
             "more than they change themselves, or by as much at all times."
         )
-    stages: list[Stage] = []
     for horizon in times:
         cut = _cut(problem, limits, horizon)
         if [e.steps for e in cut.experiments] == [e.steps for e in _cut(problem, limits, end).experiments]:
@@ -133,8 +106,7 @@ def fit_staged(
         if minimum.failure:
             cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
         z, misfit, count = minimum.z, cut.misfit(minimum.cost), len(minimum.history)
-        stages.append(Stage(horizon, problem.by_name(z), misfit, count))
-        say(f"until {horizon:.4g} s: misfit/σ {misfit:.4g}, {problem.shown(z)}, {count} iterations")
+        tell(f"until {horizon:.4g} s: misfit/σ {misfit:.4g}, {problem.shown(z)}, {count} iterations")
         limits = _limits(problem.at(z), float(growth))
     cut = _cut(problem, limits, end)
     for k, (whole, used, limit) in enumerate(zip(problem.experiments, cut.experiments, limits, strict=True)):
@@ -148,7 +120,7 @@ def fit_staged(
             warn(remarks[-1])
     start = restarted(parameters, problem.by_name(z))
     result = fit(cut.experiments, start, report=report, level=level, optimiser=optimiser, progress=progress)
-    return StagedFit(tuple(stages), result, tuple(e.t1 for e in cut.experiments), tuple(remarks))
+    return replace(result, remarks=tuple(remarks))
 
 
 def _cut(problem: FitProblem, limits: Sequence[float], horizon: float) -> FitProblem:
@@ -213,6 +185,7 @@ class RefinedFit(AbstractFit):
     from_noise: tuple[float, ...]  # the part of each error that the data's noise makes
     from_discretisation: tuple[float, ...]  # the part that is left of the discretisation
     order: tuple[float, ...]  # the order in the spacing with which each was extrapolated; NaN of what does not converge
+    remark: str = ""  # whether a misfit beyond the noise falls with the spacing, in words; empty where there is none
 
     @property
     def all(self) -> tuple[Estimate, ...]:
@@ -232,7 +205,8 @@ class RefinedFit(AbstractFit):
         for n, each in zip(self.refinements, self.fits, strict=True):
             lines += [f"spacing/{n}: {text}" for text in each.warnings]
             lines += [] if each.converged else [f"spacing/{n}: NOT CONVERGED"]
-        return "\n".join(lines)
+            lines += [] if each.screening is None else [f"spacing/{n}: {each.screening}"]
+        return "\n".join([*lines, *([self.remark] if self.remark else [])])
 
 
 @checked
@@ -242,6 +216,7 @@ def fit_refined(
     *,
     refinements: tuple[int, ...] | list[int] = (1, 2),
     order: Scalar = 1,
+    starts: int | Literal["auto"] | Starts = "auto",
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
     optimiser: AbstractOptimiser | None = None,
@@ -279,6 +254,8 @@ def fit_refined(
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
         refinements: the n, growing, two at least. Each fit starts from the one before.
         order: p, the order in the spacing. One is careful: estimates that converge faster get a wider interval.
+        starts: of the first grid, see `fit`. Finer ones start from all minima of the one before, and from others, where
+            their misfit is beyond the noise.
         parameters, report, level, optimiser, progress, resume: see `fit`.
         log: the name of the logs, one a grid: of "fit.h5" they are "fit_1.h5", "fit_2.h5". See `fit`.
 
@@ -292,12 +269,13 @@ def fit_refined(
     )
     require_positive("order", order)
     fits: list[FitResult] = []
-    start = parameters
+    start, places = parameters, as_starts(starts)
     for n in numbers:
         path = None if log is None else Path(log).with_stem(f"{Path(log).stem}_{n}")
         result = fit(
             build(n),
             start,
+            starts=places,
             report=report,
             level=level,
             optimiser=optimiser,
@@ -310,6 +288,8 @@ def fit_refined(
         if result.interrupted:
             break
         start = result.restarted(parameters)
+        minima = () if result.screening is None else result.screening.minima
+        places = replace(places, points=tuple(m.values for m in minima), if_needed=True)
     numbers = numbers[: len(fits)]
     if len(fits) < len(refinements):
         warn(f"The fit on several grids was interrupted: of {len(refinements)} grids it tells of {len(fits)}.")
@@ -317,9 +297,31 @@ def fit_refined(
     each = zip(kinds, zip(*(result.all for result in fits), strict=True), strict=True)
     normal = float(quantile(float(level), np.inf))
     missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order)) if len(fits) > 1 else 0.0
+    remark = ""
+    if len(fits) > 1 and fits[-1].is_beyond:
+        before, after = _squares(fits[-2].noise, fits[-1].noise)
+        points = sum(n.points for n in fits[-1].noise)
+        by_noise = sum(n.points for n in fits[-1].noise if not n.estimated)
+        falls = after - by_noise < _FALLS * (before - by_noise)
+        shown = f"{np.sqrt(before / points):.3g} σ on {numbers[-2]}, {np.sqrt(after / points):.3g} σ on {numbers[-1]}"
+        remark = (
+            f"The misfit falls with the spacing ({shown}): it is the discretisation's. Go on to a finer grid."
+            if falls
+            else f"The misfit does not fall with the spacing ({shown}): this is a false minimum or a wrong model, and "
+            "not the discretisation. Take more starts, or another law."
+        )
+        warn(remark)
     extrapolated = [_extrapolate(kind, of, numbers, float(order), missed, normal) for kind, of in each]
     estimates, left, orders = zip(*extrapolated, strict=True)
-    return RefinedFit(tuple(fits), tuple(numbers), estimates, tuple(e.error for e in fits[-1].all), left, orders)
+    return RefinedFit(
+        tuple(fits), tuple(numbers), estimates, tuple(e.error for e in fits[-1].all), left, orders, remark
+    )
+
+
+def _squares(coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...]) -> tuple[float, float]:
+    """Σ r² on two grids, in units of the finer one's σ."""
+    before = sum(b.points * (a.misfit * a.sigma / b.sigma) ** 2 for a, b in zip(coarse, fine, strict=True))
+    return before, sum(b.points * b.misfit**2 for b in fine)
 
 
 def _missed(
@@ -327,9 +329,8 @@ def _missed(
 ) -> float:
     """D, by how much the finest grid misses the data beyond their noise, in units of its σ: by what the sum of squares
     lost since the grid before, as the square of what falls with the spacing to the power of the order."""
-    pairs = zip(coarse, fine, strict=True)
-    lost = sum(b.points * ((a.misfit * a.sigma / b.sigma) ** 2 - b.misfit**2) for a, b in pairs)
-    return float(np.sqrt(max(lost, 0.0) / ((refinements[-1] / refinements[-2]) ** (2 * order) - 1)))
+    before, after = _squares(coarse, fine)
+    return float(np.sqrt(max(before - after, 0.0) / ((refinements[-1] / refinements[-2]) ** (2 * order) - 1)))
 
 
 def _extrapolate(
@@ -366,7 +367,7 @@ def _extrapolate(
         p = float(np.clip(np.log(shrinks) / np.log(ratio), order / 2, 2 * order)) if shrinks > 1 else float("nan")
     correction = 0.0 if np.isnan(p) else change / (ratio**p - 1)
     value = back(correction)
-    hidden = missed / 2 * last.error / (last.value if logarithmic else 1)
+    hidden = missed / 2 * last.noise_error / (last.value if logarithmic else 1)
     remains = max(abs(change) / (1 if np.isnan(p) else ratio ** min(p, order) - 1), hidden)
     if np.isnan(p):
         shown = ", ".join(f"{e.value:.5g}" for e in estimates)
@@ -389,4 +390,7 @@ def _extrapolate(
 _MOST_STAGES = 20
 _NEARLY_ALL = 0.75  # a horizon beyond this part of the end is the end
 _LEAST_TIMES = 4  # how many measured times the first horizon has, at least
+_FALLS = (
+    0.7  # part of a misfit's squares beyond the noise, below which it falls with the spacing; of order 1/2 one half
+)
 _GROWN = 1.2  # a ratio that grows by no more than this factor does not grow
