@@ -174,9 +174,9 @@ class SeparatingCollider(AbstractCollider):
 
     It has derivatives by its place and size, and those of its motion.
 
-    *When it breaks*: as a `SeparatingBox`. A body or part of it that is thinner than two spacings does not keep
-    material out, and one that moves through more than a spacing in a step leaves some behind. Not in the total
-    description.
+    *When it breaks*: as a `SeparatingBox`. Fluids do not come to rest at it: across an axis take the box. A body or
+    part of it that is thinner than two spacings does not keep material out, and one that moves through more than a
+    spacing in a step leaves some behind. Not in the total description.
 
     Args:
         shape: the body before its motion.

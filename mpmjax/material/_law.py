@@ -121,6 +121,12 @@ class AbstractLaw(eqx.Module):
     freedom: ClassVar[Freedom | None] = None
     """Degrees of freedom of a rigid body; None for deformable laws."""
 
+    @property
+    def flows(self) -> bool:
+        """Whether it bears a pressure alone at rest, but for a yield stress: `SeparatingBox` then holds it by planes.
+        Default: of J alone."""
+        return not self.measure.axes
+
     def hardly_changes_volume(self) -> bool:
         """Whether its bulk modulus is over 9.6 times its shear modulus (ν from 0.45 on). Default: by the attributes
         `bulk_modulus` and `shear_modulus`, no without these. It is asked only while numbers are known."""

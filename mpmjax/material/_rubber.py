@@ -2,9 +2,9 @@
 
 import abc
 from functools import reduce
-from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
@@ -13,17 +13,6 @@ from mpmjax.checks import as_plain, require, require_fields, require_finite, req
 from mpmjax.linalg import PowerLessOne
 from mpmjax.material._differential import IsotropicDifferential, PrincipalDifferential
 from mpmjax.material._law import AbstractMaterial
-
-
-class Work(NamedTuple):
-    """The energy w of a power sum of stretches, as a function of E."""
-
-    energy: Array
-    """w [Pa]."""
-    slope: Array
-    """dw/dE [Pa]."""
-    curvature: Array
-    """d²w/dE² [Pa]."""
 
 
 class AbstractRubber(AbstractMaterial):
@@ -47,21 +36,21 @@ class AbstractRubber(AbstractMaterial):
         """The exponents α_k [-]. The whole numbers 2 and −2, for Ī1 and Ī2, need no eigenvalues."""
 
     @abc.abstractmethod
-    def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
-        """w_k and its derivatives for each of the sums, at E_k [-], each of shape (*p)."""
+    def work(self, excess: tuple[Array, ...]) -> tuple[Array, ...]:
+        """w_k [Pa] at each E_k [-], of which it depends on no other, each of shape (*p)."""
 
     def energy(self, F: Matrix) -> Array:
         J = la.determinant(F)
         _, excess = self._strains(F, jnp.log(J))
         volumetric = self.bulk_modulus / 4 * (J**2 - 1 - 2 * jnp.log(J))
-        return sum((part.energy for part in self.work(excess)), volumetric)
+        return sum(self.work(excess), volumetric)
 
     def stress(self, F: Matrix) -> Matrix:
         J, identity = la.determinant(F), la.identity_like(F)
         strains, excess = self._strains(F, jnp.log(J))
         S = self.bulk_modulus / 2 * (J**2 - 1) * identity
-        for exponent, strain, E, part in zip(self.powers(), strains, excess, self.work(excess), strict=True):
-            S = S + exponent * part.slope * (strain - E / 3 * identity)
+        for exponent, strain, E, slope in zip(self.powers(), strains, excess, self._slopes(excess), strict=True):
+            S = S + exponent * slope * (strain - E / 3 * identity)
         return la.matmul(la.cofactor(F), S) / J
 
     def stress_differential(self, F: Matrix) -> IsotropicDifferential:
@@ -76,23 +65,28 @@ class AbstractRubber(AbstractMaterial):
         p = [power.of(s) for power in powers]
         excess = tuple(_excess(a, part.sum(axis=0), log_J, d) for a, part in zip(self.powers(), p, strict=True))
         e = [part - E / 3 for part, E in zip(p, excess, strict=True)]
-        terms = [*zip(self.powers(), self.work(excess), powers, p, e, strict=True)]
-        tau = sum((a * w.slope * e for a, w, _, _, e in terms), self.bulk_modulus / 2 * (J**2 - 1))
+        slopes, curvatures = jax.jvp(self._slopes, (excess,), (tuple(map(jnp.ones_like, excess)),))
+        terms = [*zip(self.powers(), slopes, curvatures, powers, p, e, strict=True)]
+        tau = sum((a * dw * e for a, dw, _, _, _, e in terms), self.bulk_modulus / 2 * (J**2 - 1))
 
         def growth(i: int, j: int) -> Array:
             shares = [
-                a**2 * (w.curvature * e[i] * e[j] + w.slope * ((1 + p[i]) * ((i == j) - 1 / 3) - e[j] / 3))
-                for a, w, _, p, e in terms
+                a**2 * (ddw * e[i] * e[j] + dw * ((1 + p[i]) * ((i == j) - 1 / 3) - e[j] / 3))
+                for a, dw, ddw, _, p, e in terms
             ]
             return sum(shares, self.bulk_modulus * J**2)
 
         def slope(i: int, j: int) -> Array:
-            return reduce(jnp.add, (a * w.slope * power.slope(s[j], s[i]) for a, w, power, _, _ in terms))
+            return reduce(jnp.add, (a * dw * power.slope(s[j], s[i]) for a, dw, _, power, _, _ in terms))
 
         return PrincipalDifferential.of_kirchhoff(s, tau, growth, slope)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         return la.determinant(F) > 0
+
+    def _slopes(self, excess: tuple[Array, ...]) -> tuple[Array, ...]:
+        """dw_k/dE_k [Pa]."""
+        return jax.jvp(self.work, (excess,), (tuple(map(jnp.ones_like, excess)),))[1]
 
     def _strains(self, F: Matrix, log_J: Array) -> tuple[tuple[Matrix, ...], tuple[Array, ...]]:
         """C̄^{α/2} − I and E of each exponent."""
@@ -116,11 +110,6 @@ def _isochoric_power(exponent: PerParticle, F: Matrix, log_J: Array) -> Matrix:
 def _excess(exponent: PerParticle, trace: Array, log_J: Array, dim: int) -> Array:
     """E = λ̄_1^α + λ̄_2^α + λ̄_3^α − 3 [-], zero at rest, by the trace of `_isochoric_power` in the d directions of F."""
     return trace + (3 - dim) * jnp.expm1(-exponent / 3 * log_J)
-
-
-def _linear(slope: PerParticle, E: Array) -> Work:
-    """w = slope E."""
-    return Work(slope * E, slope * jnp.ones_like(E), jnp.zeros_like(E))
 
 
 class MooneyRivlin(AbstractRubber):
@@ -161,8 +150,8 @@ class MooneyRivlin(AbstractRubber):
     def powers(self) -> tuple[PerParticle, ...]:
         return (2, -2)
 
-    def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
-        return _linear(self.c1, excess[0]), _linear(self.c2, excess[1])
+    def work(self, excess: tuple[Array, ...]) -> tuple[Array, ...]:
+        return self.c1 * excess[0], self.c2 * excess[1]
 
 
 class Yeoh(AbstractRubber):
@@ -202,10 +191,9 @@ class Yeoh(AbstractRubber):
     def powers(self) -> tuple[PerParticle, ...]:
         return (2,)
 
-    def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
+    def work(self, excess: tuple[Array, ...]) -> tuple[Array, ...]:
         (E,) = excess
-        c1, c2, c3 = self.c1, self.c2, self.c3
-        return (Work(E * (c1 + E * (c2 + E * c3)), c1 + E * (2 * c2 + 3 * E * c3), 2 * c2 + 6 * E * c3),)
+        return (E * (self.c1 + E * (self.c2 + E * self.c3)),)
 
 
 class Gent(AbstractRubber):
@@ -238,10 +226,9 @@ class Gent(AbstractRubber):
     def powers(self) -> tuple[PerParticle, ...]:
         return (2,)
 
-    def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
+    def work(self, excess: tuple[Array, ...]) -> tuple[Array, ...]:
         (E,) = excess
-        half, left = self.shear_modulus / 2, 1 - E / self.limit
-        return (Work(-half * self.limit * jnp.log1p(-E / self.limit), half / left, half / self.limit / left**2),)
+        return (-self.shear_modulus / 2 * self.limit * jnp.log1p(-E / self.limit),)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         J = la.determinant(F)
@@ -301,6 +288,5 @@ class Ogden(AbstractRubber):
     def powers(self) -> tuple[Scalar, ...]:
         return self.exponents
 
-    def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
-        each = zip(self.moduli, self.exponents, excess, strict=True)
-        return tuple(_linear(modulus / exponent, E) for modulus, exponent, E in each)
+    def work(self, excess: tuple[Array, ...]) -> tuple[Array, ...]:
+        return tuple(m / a * E for m, a, E in zip(self.moduli, self.exponents, excess, strict=True))

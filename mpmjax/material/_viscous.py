@@ -54,6 +54,7 @@ class Viscous(AbstractLaw):
     allows_total = _of_law("allows_total")
     allows_averaged_volume = _of_law("allows_averaged_volume")
     relaxes_stress = _of_law("relaxes_stress")
+    flows = _of_law("flows")  # pyright: ignore[reportIncompatibleMethodOverride]
     hardly_changes_volume = _of_law("hardly_changes_volume")
     initial_history = _of_law("initial_history")
     compaction = _of_law("compaction")

@@ -121,6 +121,10 @@ class HerschelBulkley(AbstractHenckyPlasticity):
         require_between("HerschelBulkley's consistency [Pa s^n]", self.consistency, 0, np.inf)
         require_positive("HerschelBulkley's exponent", self.exponent)
 
+    @property
+    def flows(self) -> bool:
+        return True
+
     def flow(self, history: VonMisesHistory, mean: Array, deviation: Array, dt: Scalar) -> tuple[Array, Array, Array]:
         """Return of the deviator to the overstress of its flow over the step."""
         stiffness = self.elastic(history).shear_modulus

@@ -16,6 +16,7 @@ from mpmjax._types import Array, Bool, Float, Int, ParticleVector
 from mpmjax.boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.checks import warn
 from mpmjax.discretisation import BSpline, Grid
+from mpmjax.geometry import HalfSpace
 from mpmjax.material import AbstractLaw
 from mpmjax.state._particles import Particles
 from mpmjax.state._scene import Scene
@@ -60,6 +61,8 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
                 f"{inside} of {particles.count} particles lie in or beyond the {name} at the start: nodes there do "
                 "not move freely. Move one of them; to hold a body on purpose take a Grip."
             )
+        if any(law.flows for law in scene.laws) and (told := _unfit_for_fluids(condition, dx)):
+            warn(f"The {name} {told}")
         if mask is not None:
             may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
             if not may_meet:  # only the nodes in a particle's stencil
@@ -176,6 +179,24 @@ def _probe(
         return acts if colliders is None else acts | colliders.touched
 
     return [covered(b) for b in boundary], [touched(b) if r else None for b, r in zip(boundary, resting, strict=True)]
+
+
+def _unfit_for_fluids(boundary: AbstractBoundary, dx: float) -> str | None:
+    """The end of a warning of a boundary at rest across an axis at which fluids find no rest, or not where it is; None
+    of others."""
+    shape, instead = getattr(boundary, "shape", None), "take a SymmetryPlane, ContactPlane or SeparatingBox"
+    places = [wall.position for wall in boundary.walls() if not wall.mirrored]
+    if isinstance(shape, HalfSpace):
+        point, normal = (np.asarray(jnp.asarray(a), float) for a in (shape.point, shape.normal))
+        places = point[normal != 0].tolist() if np.count_nonzero(normal) == 1 else []
+    if getattr(boundary, "motion", None) is not None or not places:
+        return None
+    if boundary.pushes:
+        stirs = "pushes the faces of a fluid and so stirs it, by a tenth or more of the pressure at its floor: across"
+        return f"{stirs} an axis {instead}." if boundary.collider_count else None
+    beside = np.abs(np.asarray(places) / dx - np.round(np.asarray(places) / dx)) > ON_THE_WALL
+    holds = "lies between nodes and holds a fluid at those behind it, up to a spacing further: move it to nodes, or"
+    return f"{holds} {instead}." if beside.any() else None
 
 
 def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Any) -> Any:

@@ -30,7 +30,7 @@ def faces_of(
     for law, points in zip(scene.laws, materials, strict=True):
         side = points.volume ** (1 / particles.dim)
         shape = points.deformation if law.allows_total else points.volume_ratio()
-        shapes.append(FaceShape(side / 2, shape, points.rows, points.total, points.deformation.ndim == 1))
+        shapes.append(FaceShape(side / 2, shape, points.rows, points.total, law.flows))
         # of a sliver A = V0/l0 is large for its mass, and would shorten explicit steps
         areas.append(points.volume / (side.max(initial=0) if explicit else side))
     at = 0.0 if explicit else jnp.asarray(force_at, particles.x.dtype)
