@@ -1,7 +1,7 @@
-// A few particles at a time: their factors and rows, copied to the stack.
+// A block of particles: their polynomials and index, copied to the stack.
 //
-// Arrays (d, s, p) and (c, p) are some forty streams. When p is a power of two they all fall on the same lines of a
-// cache, so each is read in whole lines.
+// Arrays (d, p) and (c, p) are some forty streams. When p is a power of two they all fall on the same lines of a cache,
+// so each is read in whole lines.
 
 #pragma once
 
@@ -10,7 +10,6 @@
 
 namespace {
 
-using mpmjax::ParticleValues;
 using mpmjax::kBlock;
 using mpmjax::Stencils;
 
@@ -32,28 +31,39 @@ MPMJAX_INLINE BlockInt wrapping_sum(BlockInt first, BlockInt term) {
   return (BlockInt)((BlockUint)first + (BlockUint)term);
 }
 
-// Copies up to a block of numbers; what is missing is zero.
-template <class T>
-MPMJAX_NOINLINE void copy_partial(const T* from, int count, T* to) {
-  std::memset(to, 0, kBlock * sizeof(T));
-  for (int q = 0; q < count; ++q) to[q] = from[q];
-}
-
-// Asks for what a later block has of an array, to read it or to write it. Blocks come one after the other, in more streams
-// than a processor foresees by itself.
+// Asks for what a later block has of an array, to read it or to write it. Blocks come one after the other, in more
+// streams than a processor foresees by itself.
 template <bool to_write = false, class T>
 MPMJAX_INLINE void prefetch(const T* from) {
   const uintptr_t later = reinterpret_cast<uintptr_t>(from) + kAhead * sizeof(T);  // perhaps beyond the array's end
   __builtin_prefetch(reinterpret_cast<const void*>(later), to_write);
 }
 
-// Copies a block, or what there is of it.
+template <bool to_write = false, class T>
+MPMJAX_INLINE void prefetch_block(const T* from) {
+  prefetch<to_write>(from);
+  if (kBlock * sizeof(T) > 64) prefetch<to_write>(from + kBlock / 2);
+}
+
+// Copies up to a block of numbers; what is missing is zero.
+template <class T>
+MPMJAX_NOINLINE void copy_partial(const T* from, int count, T* to) {
+  std::memset(to, 0, kBlock * sizeof(T));
+  std::copy(from, from + count, to);
+}
 template <class T>
 MPMJAX_INLINE void copy(const T* from, int count, T* to) {
   if (__builtin_expect(count != kBlock, 0)) return copy_partial(from, count, to);
   std::memcpy(to, from, kBlock * sizeof(T));
-  prefetch(from);
-  if (kBlock * sizeof(T) > 64) prefetch(from + kBlock / 2);
+  prefetch_block(from);
+}
+
+// Copies back as many numbers as there are.
+template <class T>
+MPMJAX_INLINE void write(const T* from, int count, T* to) {
+  if (count != kBlock) return void(std::copy(from, from + count, to));
+  std::memcpy(to, from, kBlock * sizeof(T));
+  prefetch_block<true>(to);
 }
 
 // Columns of a block as rows: row q has the q-th number of each column, and zeros.
@@ -61,7 +71,7 @@ template <class T, int columns>
 MPMJAX_INLINE void to_rows(const T (*from)[kBlock], Vector<T>* rows) {
   for (int q = 0; q < kBlock; q += kLanes) {
     Vector<T> turned[kLanes] = {};
-    for (int c = 0; c < columns; ++c) turned[c] = load(from[c] + q);
+    for (int c = 0; c < columns; ++c) turned[c] = load_as<Vector<T>>(from[c] + q);
     transpose<T>(turned, rows + q);
   }
 }
@@ -75,44 +85,35 @@ constexpr auto before_of(std::integer_sequence<int, lane...>) {
 // The weights of a block and their slopes along each axis.
 template <class T, int d, int s>
 struct Block {
-  static constexpr int axes = d;
-
   int32_t index[d][s][kBlock];
   T weights[d][s][kBlock];
   T slopes[d][s][kBlock];
   // The last axis' of each particle as rows of four.
   Vector<T> last_weights[kRoom], last_slopes[kRoom];
-  // Whether the nodes along the last axis follow each other.
-  int32_t contiguous[kBlock];
-  // Whether the nodes are those of the particle before in the block.
-  int32_t same_nodes[kBlock];
+  int32_t contiguous[kBlock];  // whether the nodes along the last axis follow each other
+  int32_t same_nodes[kBlock];  // whether the nodes are those of the particle before in the block
   // The least and the largest flat index of a particle's nodes, and those from the axes after the first alone.
   int32_t least[kBlock], most[kBlock];
   int32_t least_beyond[kBlock], most_beyond[kBlock];
 
   typedef T BlockVector __attribute__((vector_size(kBlock * sizeof(T))));
 
-  // The polynomials, and of an axis that is told their derivatives times dt; those of no particle are zero. The index is
-  // read by `find_range`.
-  MPMJAX_NOINLINE void evaluate(const Stencils<T>& from, int64_t first, int count, int along = -1) {
+  // The polynomials, with derivatives along some axes, a bit each, times dt if there is one; those of no particle are
+  // zero. The index is read by `find_range`.
+  MPMJAX_NOINLINE void evaluate(const Stencils<T>& from, int64_t first, int count, unsigned differentiated = 0) {
     for (int a = 0; a < d; ++a) {
       const int64_t at = a * from.particles + first;
-      if (a == along) {
-        set<1>(from.basis, a, load_block(from.offset + at, count), count, load_block(from.change + at, count));
+      const BlockVector t = load_block(from.offset + at, count), one = BlockVector{} + 1;
+      if (differentiated >> a & 1) {
+        set<1>(from.basis, a, t, count, from.change == nullptr ? one : load_block(from.change + at, count));
       } else {
-        set<0>(from.basis, a, load_block(from.offset + at, count), count);
+        set<0>(from.basis, a, t, count, one);
       }
     }
   }
 
-  // Their derivatives, of each axis.
-  MPMJAX_NOINLINE void differentiate(const Stencils<T>& from, int64_t first, int count) {
-    for (int a = 0; a < d; ++a) set<1>(from.basis, a, load_block(from.offset + a * from.particles + first, count), count);
-  }
-
   template <int order>
-  MPMJAX_INLINE void set(const mpmjax::Basis<T>& basis, int a, BlockVector t, int count,
-                         BlockVector factor = BlockVector{} + 1) {
+  MPMJAX_INLINE void set(const mpmjax::Basis<T>& basis, int a, BlockVector t, int count, BlockVector factor) {
     polynomials<order>(basis, basis.weights, t, count, factor, weights[a]);
     polynomials<order>(basis, basis.slopes, t, count, factor, slopes[a]);
   }
@@ -135,9 +136,7 @@ struct Block {
   static MPMJAX_INLINE BlockVector load_block(const T* from, int count) {
     T numbers[kBlock];
     copy(from, count, numbers);
-    BlockVector v;
-    std::memcpy(&v, numbers, sizeof v);
-    return v;
+    return load_as<BlockVector>(numbers);
   }
 
   // Stores numbers of a block, those of no particle as zero.
@@ -153,8 +152,7 @@ struct Block {
     int32_t begin[kBlock];
     copy(from.first + a * from.particles + first, count, begin);
     const uint32_t stride = static_cast<uint32_t>(from.basis.strides[a]);
-    BlockUint node;
-    std::memcpy(&node, begin, sizeof node);
+    const BlockUint node = load_as<BlockUint>(begin);
 #pragma GCC unroll 4
     for (int i = 0; i < s; ++i) put((node + i) * stride, count, index[a][i]);
     if (from.basis.periodic[a]) wrap_index(from.basis.shape[a], stride, begin, count, index[a]);
@@ -187,8 +185,7 @@ struct Block {
       read_index(from, a, first, count);
 #pragma GCC unroll 4
       for (int i = 0; i < s; ++i) {
-        BlockInt term;
-        std::memcpy(&term, index[a][i], sizeof term);
+        const BlockInt term = load_as<BlockInt>(index[a][i]);
         if (i == 0) first_term = low = high = term;
         low = term < low ? term : low;
         high = term > high ? term : high;
@@ -200,8 +197,7 @@ struct Block {
       high_sum = wrapping_sum(high_sum, high);
     }
     put(low_sum, high_sum, large, least, most);
-    const BlockInt even = bent == 0;
-    std::memcpy(contiguous, &even, sizeof even);
+    store(contiguous, BlockInt(bent == 0));
   }
 
   // Finds, from the index, which particles have the nodes of the one before.
@@ -209,55 +205,26 @@ struct Block {
     BlockInt apart = {};
     for (int a = 0; a < d; ++a) {
       for (int i = 0; i < s; ++i) {
-        BlockInt term;
-        std::memcpy(&term, index[a][i], sizeof term);
+        const BlockInt term = load_as<BlockInt>(index[a][i]);
         apart |= term ^ shuffled<BlockInt>(term, before_of(Count<kBlock>()));
       }
     }
-    const BlockInt same = apart == 0;
-    std::memcpy(same_nodes, &same, sizeof same);
+    store(same_nodes, BlockInt(apart == 0));
   }
 
   static MPMJAX_INLINE void put(BlockInt low, BlockInt high, BlockInt large, int32_t* to_least, int32_t* to_most) {
-    low = large != 0 ? BlockInt{} + INT32_MIN : low;
-    high = large != 0 ? BlockInt{} + INT32_MAX : high;
-    std::memcpy(to_least, &low, sizeof low);
-    std::memcpy(to_most, &high, sizeof high);
+    store(to_least, large != 0 ? BlockInt{} + INT32_MIN : low);
+    store(to_most, large != 0 ? BlockInt{} + INT32_MAX : high);
   }
 
-  // The last axis' of one particle, for all its nodes.
-  template <class R>
-  MPMJAX_INLINE R last_weight(int q) const {
-    return by_node<R, T>(last_weights[q]);
-  }
-
-  template <class R>
-  MPMJAX_INLINE R last_slope(int q) const {
-    return by_node<R, T>(last_slopes[q]);
+  // The flat index of the j-th node of a row, in C order of the axes before the last. It wraps, as read_index says.
+  MPMJAX_INLINE int32_t node(int row, int q, int j = 0) const {
+    int32_t sum = index[d - 1][j][q];
+    if constexpr (d == 2) sum = wrapping_sum(index[0][row][q], sum);
+    if constexpr (d == 3) sum = wrapping_sum(wrapping_sum(index[0][row / s][q], index[1][row % s][q]), sum);
+    return sum;
   }
 };
-
-// Copies back as many numbers as there are.
-template <class T>
-MPMJAX_INLINE void write(const T* from, int count, T* to) {
-  if (count == kBlock) {
-    std::memcpy(to, from, kBlock * sizeof(T));
-    prefetch<true>(to);
-    if (kBlock * sizeof(T) > 64) prefetch<true>(to + kBlock / 2);
-  } else {
-    for (int q = 0; q < count; ++q) to[q] = from[q];
-  }
-}
-
-// The other way round.
-template <class T>
-MPMJAX_INLINE void to_columns(const Vector<T>* rows, T (*columns)[kBlock]) {
-  for (int q = 0; q < kBlock; q += kLanes) {
-    Vector<T> turned[kLanes];
-    transpose<T>(rows + q, turned);
-    for (int c = 0; c < kLanes; ++c) store(columns[c] + q, turned[c]);
-  }
-}
 
 // Four columns of a block's rows: from (c, p), of which `used` columns exist, the row of each particle.
 template <class T>
@@ -267,43 +234,15 @@ MPMJAX_NOINLINE void read_rows(const T* from, int64_t particles, int count, int 
   to_rows<T, kLanes>(columns, rows);
 }
 
-// The rows of what a block's particles give, up to four columns of the value and with `graded` of each gradient after it.
-template <class T, int d, bool graded>
-MPMJAX_INLINE void read_values(const ParticleValues<T>& values, int64_t particles, int64_t column, int used,
-                               int64_t start, int count, Vector<T> (*rows)[kRoom]) {
-  const auto read = [&](const T* from, int64_t columns, Vector<T>* to) MPMJAX_INLINE_LAMBDA {
-    if (from == nullptr || column >= columns) {
-      std::memset(to, 0, kRoom * sizeof *to);
-    } else {
-      read_rows(from + column * particles + start, particles, count, smaller(columns - column, used), to);
-    }
-  };
-  read(values.value, column + used, rows[0]);
-  if constexpr (graded) {
-    const int64_t each = values.graded * particles;
-    for (int b = 0; b < d; ++b) {
-      read(values.gradients == nullptr ? nullptr : values.gradients + b * each, values.graded, rows[b + 1]);
-    }
-  }
-}
-
-// The other way round: writes the rows of a block as columns of (c, p).
-template <class T>
-MPMJAX_NOINLINE void write_rows(const Vector<T>* rows, T* to, int64_t particles, int count, int used) {
-  alignas(64) T columns[kLanes][kBlock];
-  to_columns<T>(rows, columns);
-  for (int c = 0; c < used; ++c) write(columns[c], count, to + c * particles);
-}
-
-// A differential along dt is a sum over the axes, of the same sums with derivatives along one of them: the first axis and
-// the end of these passes. The sum itself is one pass, along none.
-template <class T>
-MPMJAX_INLINE int first_pass(const Stencils<T>& stencils) {
-  return stencils.change == nullptr ? -1 : 0;
-}
+// A differential along dt is a sum over the axes, of the same sums with derivatives along one of them: a pass for each.
+// The sum itself is one pass, with no derivative.
 template <int d, class T>
-MPMJAX_INLINE int end_of_passes(const Stencils<T>& stencils) {
-  return stencils.change == nullptr ? 0 : d;
+MPMJAX_INLINE int passes(const Stencils<T>& stencils) {
+  return stencils.change == nullptr ? 1 : d;
+}
+template <class T>
+MPMJAX_INLINE unsigned differentiated(const Stencils<T>& stencils, int pass) {
+  return stencils.change == nullptr ? 0 : 1u << pass;
 }
 
 }  // namespace

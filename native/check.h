@@ -2,6 +2,7 @@
 
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <condition_variable>
 #include <cstdio>
@@ -10,7 +11,9 @@
 #include <limits>
 #include <memory>
 #include <mutex>
+#include <random>
 #include <thread>
+#include <tuple>
 #include <vector>
 
 #include "share.h"
@@ -66,7 +69,14 @@ struct Array {
   std::unique_ptr<T[]> data;
   int64_t size;
   explicit Array(int64_t n) : data(new T[n]()), size(n) {}
-  Array(const Array& other) : Array(other.size) { std::memcpy(data.get(), other.data.get(), size * sizeof(T)); }
+  Array(const Array& other) : Array(other.size) { std::copy(other.get(), other.get() + size, get()); }
+  T* get() const { return data.get(); }
+  void fill(T value) const { std::fill(get(), get() + size, value); }
+  template <class Random>
+  void draw(Random& random) const {
+    std::normal_distribution<T> normal;
+    std::generate(get(), get() + size, [&] { return normal(random); });
+  }
   T& operator[](int64_t i) const { return data[i]; }
 };
 
@@ -78,26 +88,48 @@ struct Shape {
 
 inline int faults = 0;
 
+// What numbers should be, and what bounds their rounding.
+struct Expected {
+  std::vector<double> value, scale;
+  explicit Expected(int64_t size, double least = 0) : value(size), scale(size, least) {}
+  void add(int64_t at, double term, double bound) { value[at] += term, scale[at] += bound; }
+};
+
 template <class T>
-void compare(const char* what, const Shape& sh, const Array<T>& result, const std::vector<double>& expected,
-             const std::vector<double>& scale) {
+void compare(const char* what, const Shape& sh, const Array<T>& result, const Expected& expected) {
   const double tolerance = 64 * std::numeric_limits<T>::epsilon();
   for (int64_t i = 0; i < result.size; ++i) {
-    const double error = std::abs(result[i] - expected[i]);
-    const bool both = !std::isfinite(expected[i]) && !std::isfinite(result[i]);
-    if (both || error <= tolerance * scale[i]) continue;
+    const double value = expected.value[i], error = std::abs(result[i] - value);
+    const bool both = !std::isfinite(value) && !std::isfinite(result[i]);
+    if (both || error <= tolerance * expected.scale[i]) continue;
     if (++faults < 20) {
       std::printf("%s d=%d s=%d columns=%lld particles=%lld: [%lld] is %g, expected %g\n", what, sh.d, sh.s,
-                  (long long)sh.columns, (long long)sh.particles, (long long)i, double(result[i]), expected[i]);
+                  (long long)sh.columns, (long long)sh.particles, (long long)i, double(result[i]), value);
     }
     return;
   }
 }
 
 template <class T>
+void copy(const Array<T>& from, const Array<T>& to) {
+  std::copy(from.get(), from.get() + from.size, to.get());
+}
+
+template <class T>
 void expect_same(const char* what, const Array<T>& one, const Array<T>& other) {
-  if (std::memcmp(one.data.get(), other.data.get(), one.size * sizeof(T)) == 0) return;
+  if (std::memcmp(one.get(), other.get(), one.size * sizeof(T)) == 0) return;
   if (++faults < 20) std::printf("%s: other bits than expected\n", what);
+}
+
+// Calls run(pool) for each pool, after which the results have the same bits as with the first one.
+template <class Run, class... Arrays>
+void by_all(const std::vector<const Pool*>& pools, const char* what, const Run& run, const Arrays&... results) {
+  std::tuple<Arrays...> first(results...);
+  for (const Pool* pool : pools) {
+    run(*pool);
+    if (pool == pools[0]) std::apply([&](Arrays&... kept) { (copy(results, kept), ...); }, first);
+    std::apply([&](const Arrays&... kept) { (expect_same(what, kept, results), ...); }, first);
+  }
 }
 
 // Passes over arrays, by every pool with the same bits; returns the number of examples.

@@ -1,125 +1,277 @@
-// The gather: a_p = Σ_i w_ip f_i and a_p,b = Σ_i g_ip,b f_i.
+// The gather, a_p = Σ_i w_ip f_i and a_p,b = Σ_i g_ip,b f_i, and the pull, the derivative of
+// B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b) by the offset along each axis.
+//
+// There is a particle in each lane, so that sums over its nodes are sums of vectors, and what particles have is read
+// and written as it lies. The nodes of a row are read once, by runs where there are few; else they are read particle by
+// particle and transposed. Each axis then takes the sums over the axes after it one step further out.
 
 #pragma once
 
-#include "field.h"
-#include "node_rows.h"
+#include "runs.h"
 
 namespace {
 
 using mpmjax::Gather;
+using mpmjax::Pull;
 
-// The sums over the axes from a on: the value, and a gradient for each of these axes.
-template <class X, int count>
-struct Sums {
-  X value;
-  X gradients[count == 0 ? 1 : count];
-};
-
-// Each axis but the last takes the sums of rows over the axes after it one step further out: Σ_i over the nodes along
-// it, of the value times weights and times slopes, of the gradients times weights. The last axis is summed at the
-// end, within the row.
-template <class T, int d, int s, bool inside, int columns>
-struct Gatherer {
-  const Block<T, d, s>& block;
-  const NodeRows<T, s, columns>& rows;
-  int q;
-
-  static constexpr int last = d - 1;
-  using R = RowOf<T, s, columns>;
+// A gather. Its sums over the axes from a on: the value, and the gradients along these axes, of all columns.
+template <class T, int d, int s, int columns>
+struct GatherSums {
+  using V = Simd<T>;
+  static constexpr bool unrolled = true;
 
   template <int a>
-  MPMJAX_INLINE auto sums(int32_t first) const {
-    if constexpr (a == last) {
-      return Sums<R, 0>{rows.template at<inside>(block, q, first), {}};
-    } else {
-      Sums<R, last - a> total = {};
-      each<s, inside>([&](int i) MPMJAX_INLINE_LAMBDA {
-        const auto inner = sums<a + 1>(wrapping_sum(first, block.index[a][i][q]));
-        const T w = block.weights[a][i][q], g = block.slopes[a][i][q];
-        total.value = total.value + product(w, inner.value);
-        total.gradients[0] = total.gradients[0] + product(g, inner.value);
-        for (int b = 1; b < last - a; ++b) total.gradients[b] = total.gradients[b] + product(w, inner.gradients[b - 1]);
-      });
-      return total;
-    }
-  }
+  struct At {
+    V value[columns] = {}, gradients[d - a + 1][columns] = {};
 
-  // The value and all gradients, in four lanes of which those of the columns count.
-  MPMJAX_INLINE Sums<Vector<T>, d> all() const {
-    const auto w = block.template last_weight<R>(q), g = block.template last_slope<R>(q);
-    const auto result = sums<0>(0);
-    Sums<Vector<T>, d> total;
-    total.value = sum(product(w, result.value));
-    for (int b = 0; b < last; ++b) total.gradients[b] = sum(product(w, result.gradients[b]));
-    total.gradients[last] = sum(product(g, result.value));
-    return total;
+    // Adds the sums over the axes after a, of the i-th node along it.
+    template <class Nodes>
+    MPMJAX_INLINE void add(const Nodes& nodes, int i, const At<a + 1>& inner) {
+      const V w = nodes.at(nodes.block.weights[a][i]), g = nodes.at(nodes.block.slopes[a][i]);
+#pragma GCC unroll 4
+      for (int c = 0; c < columns; ++c) {
+        value[c] += w * inner.value[c];
+        gradients[0][c] += g * inner.value[c];
+#pragma GCC unroll 2
+        for (int b = 1; b < d - a; ++b) gradients[b][c] += w * inner.gradients[b - 1][c];
+      }
+    }
+  };
+
+  // The sums over no axis: the j-th node of a row.
+  static MPMJAX_INLINE At<d> node(const NodeRow<T, s, columns>& row, int j) {
+    At<d> result;
+#pragma GCC unroll 4
+    for (int c = 0; c < columns; ++c) result.value[c] = row.at[j * columns + c];
+    return result;
   }
 };
 
-// The sums of a block's particles, each handed to put(q, sums).
-template <class T, int d, int s, int columns, class Put>
-MPMJAX_INLINE void gather_block(const Block<T, d, s>& block, const NodeRows<T, s, columns>& rows,
-                                const Put& put) {
-  for (int q = 0; q < kBlock; ++q) {  // beyond the count weights are zero and the index is 0
-    if (rows.holds(block, q)) {
-      put(q, Gatherer<T, d, s, true, columns>{block, rows, q}.all());
-    } else {
-      put(q, Gatherer<T, d, s, false, columns>{block, rows, q}.all());
-    }
-  }
-}
+// What a vector of particles gives: the value and each gradient, zero where there are none.
+template <class T, int d, int columns>
+struct GivenValues {
+  Simd<T> at[d + 1][columns] = {};
+  int used;
 
-// Some columns of a block, row by row, to where the block's particles begin, or added to what is there.
-template <class T, int d, int s, int columns>
-MPMJAX_INLINE void gather_rows(const Block<T, d, s>& block, const NodeRows<T, s, columns>& rows, int64_t particles,
-                               int64_t all_columns, int count, T* value, T* gradients, bool add = false) {
-  Vector<T> sums[d + 1][kBlock];
-  gather_block(block, rows, [&](int q, const auto& result) MPMJAX_INLINE_LAMBDA {
-    sums[0][q] = result.value;
-    for (int b = 0; b < d; ++b) sums[b + 1][q] = result.gradients[b];
-  });
-  for (int b = 0; b <= d; ++b) {
-    T* to = b == 0 ? value : gradients + (b - 1) * all_columns * particles;
-    if (add) {
-      Vector<T> before[kRoom];
-      read_rows<T>(to, particles, count, rows.used, before);
-      for (int q = 0; q < kBlock; ++q) sums[b][q] += before[q];
-    }
-    write_rows<T>(sums[b], to, particles, count, rows.used);
+  MPMJAX_INLINE GivenValues(const ParticleLanes<T>& lanes, const Pull<T>& task, int64_t column, int used) : used(used) {
+    const auto& values = task.values;
+    by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
+      for (int c = 0; c < used; ++c) {
+        if (values.value != nullptr) at[0][c] = lanes.template load<all>(values.value, column + c);
+        for (int b = 0; b < d && column + c < values.graded; ++b) {
+          at[b + 1][c] = lanes.template load<all>(values.gradients, b * values.graded + column + c);
+        }
+      }
+    });
   }
+};
+
+// A pull, and the gather beside it. B is linear in the numbers f · a and f · a_b of each node. Its sums over the axes
+// from a on: without a derivative, and by the offset along each of these axes, one of f · a and the gradients along
+// these axes, and one of f · a_b for each axis before them.
+template <class T, int d, int s, int columns>
+struct PullSums {
+  using V = Simd<T>;
+  using Given = GivenValues<T, d, columns>;
+  static constexpr bool unrolled = d < 3;  // else the code doubles
+
+  template <int a>
+  struct At {
+    typename GatherSums<T, d, s, columns>::template At<a> gathered;
+    V by[d - a + 1][a + 1] = {};
+
+    template <class Nodes>
+    MPMJAX_INLINE void add(const Nodes& nodes, int i, const At<a + 1>& inner) {
+      gathered.add(nodes, i, inner.gathered);
+      const V w = nodes.at(nodes.block.weights[a][i]), g = nodes.at(nodes.block.slopes[a][i]);
+      const auto join = [](V w, V g, const V* from, V* to) MPMJAX_INLINE_LAMBDA {
+        to[0] += w * from[0] + g * from[a + 1];
+#pragma GCC unroll 2
+        for (int b = 1; b <= a; ++b) to[b] += w * from[b];
+      };
+      join(w, g, inner.by[0], by[0]);
+      join(nodes.at(nodes.derivatives->weights[a][i]), nodes.at(nodes.derivatives->slopes[a][i]), inner.by[0], by[1]);
+#pragma GCC unroll 2
+      for (int m = 1; m < d - a; ++m) join(w, g, inner.by[m], by[m + 1]);
+    }
+  };
+
+  static MPMJAX_INLINE At<d> node(const NodeRow<T, s, columns>& row, int j, const Given& given) {
+    At<d> result;
+    result.gathered = GatherSums<T, d, s, columns>::node(row, j);
+#pragma GCC unroll 4
+    for (int b = 0; b <= d; ++b) {
+#pragma GCC unroll 4
+      for (int c = 0; c < columns; ++c) {
+        if (c < given.used) result.by[0][b] += given.at[b][c] * row.at[j * columns + c];
+      }
+    }
+    return result;
+  }
+};
+
+// The nodes of a vector of particles, from the q-th of a block on: all columns, or where `columns_` is 0 up to four
+// from a first one. An index beyond the window is clipped to its ends, as in XLA's gather with mode "clip".
+template <class T, int d, int s, int columns_>
+struct Nodes {
+  static constexpr int columns = columns_ == 0 ? kLanes : columns_;
+  static constexpr int rows = power(s, d - 1), lanes = kSimdLanes<T>;
+  static constexpr int numbers = (s * columns + kLanes - 1) / kLanes * kLanes;  // of a row, in whole fours
+  static constexpr bool permutes = kPermutes<T> && columns_ > 0;
+  using Row = NodeRow<T, s, columns>;
+  using Index = LanesOf<float, lanes>;
+
+  const Block<T, d, s>& block;
+  const Block<T, d, s>* derivatives;  // of the polynomials, for a pull
+  int q;
+  const T* from;  // at the first of the columns
+  int64_t size, stride;
+  int used;
+  int32_t most;  // the last node of a row that can be read in whole fours, which reach beyond it, or -1
+  Runs<T, d, s, columns> runs;
+  bool joined = false;  // whether rows are read by runs
+  Row stored[rows];     // if they are not, in C order of the axes before the last
+
+  MPMJAX_INLINE Nodes(const Block<T, d, s>& block, int q, const T* whole, int64_t size, int64_t all, int64_t column,
+                      const Block<T, d, s>* derivatives = nullptr)
+      : block(block), derivatives(derivatives), q(q), from(whole + column), size(size),
+        stride(columns_ == 0 ? all : columns_), used(columns_ == 0 ? smaller(all - column, kLanes) : columns_) {
+    const int64_t extent = size * all - column, reach = columns_ == 0 ? (s - 1) * stride + kLanes : numbers;
+    const int64_t last = std::min(size - 1, (extent - reach) / stride + s - 1);
+    most = extent < reach ? -1 : smaller(last, INT32_MAX);
+    const Index least = load_as<Index>(block.least + q), ends = load_as<Index>(block.most + q);
+    const bool whole_rows = !any((load_as<Index>(block.contiguous + q) == 0) | (least < 0) | (ends > most));
+    if constexpr (permutes) joined = whole_rows && runs.find(block, q, size);
+    if (!joined) whole_rows ? read<true>() : read<false>();
+  }
+
+  // Reads all rows, four numbers of four particles at a time. Those that cannot be read as a whole are copied before.
+  template <bool whole_rows>
+  MPMJAX_NOINLINE void read() {
+    for (int row = 0; row < rows; ++row) {
+      for (int p = 0; p < lanes; p += kLanes) {
+        T copies[kLanes][numbers];
+        const T* places[kLanes];
+        int64_t steps[kLanes];
+        for (int e = 0; e < kLanes; ++e) {
+          const int k = q + p + e;
+          const bool whole = whole_rows || (block.contiguous[k] && block.least[k] >= 0 && block.most[k] <= most);
+          if (!whole) copy_row(row, k, copies[e]);
+          places[e] = whole ? from + block.node(row, k) * stride : copies[e];
+          steps[e] = whole && columns_ == 0 ? stride : kLanes;
+        }
+#pragma GCC unroll 4
+        for (int k = 0; k < numbers; k += kLanes) {
+          Vector<T> read[kLanes], turned[kLanes];
+          for (int e = 0; e < kLanes; ++e) read[e] = load_as<Vector<T>>(places[e] + k / kLanes * steps[e]);
+          transpose<T>(read, turned);
+          for (int e = 0; e < kLanes && k + e < Row::numbers; ++e) {
+            store(reinterpret_cast<T*>(&stored[row].at[k + e]) + p, turned[e]);
+          }
+        }
+      }
+    }
+  }
+
+  // The row of one particle, wherever its nodes lie; zero in columns that there are not.
+  MPMJAX_NOINLINE void copy_row(int row, int particle, T* to) const {
+    std::memset(to, 0, numbers * sizeof(T));
+    for (int j = 0; j < s; ++j) {
+      const int64_t clipped = std::clamp<int64_t>(block.node(row, particle, j), 0, size - 1);
+      std::memcpy(to + j * columns, from + clipped * stride, used * sizeof(T));
+    }
+  }
+
+  // The sums over the axes from a on, of rows from a first one on.
+  template <class Sums, int a = 0, class Read, class... Given>
+  MPMJAX_INLINE auto sum_from(int first, const Read& read_row, const Given&... given) const {
+    constexpr int last = d - 1;
+    typename Sums::template At<a> total;
+    if constexpr (a == last) {
+      const auto row = read_row(first);
+      each<s>([&](int j) MPMJAX_INLINE_LAMBDA { total.add(*this, j, Sums::node(row, j, given...)); });
+    } else {
+      each<s, Sums::unrolled && a + 1 == last>([&](int i) MPMJAX_INLINE_LAMBDA {
+        total.add(*this, i, sum_from<Sums, a + 1>(s * first + i, read_row, given...));
+      });
+    }
+    return total;
+  }
+
+  // The sums over all nodes, which a pull takes times what is given.
+  template <class Sums, class... Given>
+  MPMJAX_INLINE auto sum(const Given&... given) const {
+    if constexpr (permutes) {
+      if (joined) {
+        return sum_from<Sums>(0, [&](int i) MPMJAX_INLINE_LAMBDA { return runs.row(block, q, from, i); }, given...);
+      }
+    }
+    return sum_from<Sums>(0, [&](int i) MPMJAX_INLINE_LAMBDA { return stored[i]; }, given...);
+  }
+
+  MPMJAX_INLINE auto gather() const { return sum<GatherSums<T, d, s, columns>>(); }
+
+  // The numbers of these particles among those of a block.
+  MPMJAX_INLINE Simd<T> at(const T* numbers) const { return load_as<Simd<T>>(numbers + q); }
+};
+
+// Stores the columns that are used of a gather, or adds them to what is there.
+template <int d, class T, class Sums>
+MPMJAX_INLINE void put(const ParticleLanes<T>& lanes, const Sums& sums, int64_t column, int used, int64_t rows,
+                       T* value, T* gradients, bool add = false) {
+  by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
+    const auto store = [&](T* to, int64_t row, Simd<T> v) MPMJAX_INLINE_LAMBDA {
+      lanes.template store<all>(to, row, add ? v + lanes.template load<all>(to, row) : v);
+    };
+    for (int c = 0; c < used; ++c) {
+      store(value, column + c, sums.value[c]);
+      for (int b = 0; b < d; ++b) store(gradients, b * rows + column + c, sums.gradients[b][c]);
+    }
+  });
 }
 
 template <class T, int d, int s, int columns>
 void gather_columns(const Gather<T>& task, int64_t first, int64_t last) {
-  const int64_t particles = task.stencils.particles;
   for (int64_t start = first; start < last; start += kBlock) {
     const int count = smaller(last - start, kBlock);
     Block<T, d, s> block;
     block.find_range(task.stencils, start, count);
-    for (int pass = first_pass(task.stencils); pass < end_of_passes<d>(task.stencils); ++pass) {
-      block.evaluate(task.stencils, start, count, pass);
-      if constexpr (columns > 0) {
-        if (has_fields<T, d, s, columns>(block, task.size)) {
-          for (int q = 0; q < kBlock; q += kSimdLanes<T>) {
-            const Fields<T, d, s, columns> some(block, q, task.nodes, task.size);
-            const auto result = some.gather();
-            for (int c = 0; c < columns; ++c) {
-              const int64_t at = c * particles + start + q;
-              some.put(result.value[c], task.value + at, pass > 0);
-              for (int b = 0; b < d; ++b) {
-                some.put(result.gradients[b][c], task.gradients + b * columns * particles + at, pass > 0);
-              }
-            }
-          }
-          continue;
+    for (int pass = 0; pass < passes<d>(task.stencils); ++pass) {
+      block.evaluate(task.stencils, start, count, differentiated(task.stencils, pass));
+      for (int64_t c = 0; c < task.columns; c += columns == 0 ? kLanes : columns) {
+        for (int q = 0; q < count; q += kSimdLanes<T>) {
+          const Nodes<T, d, s, columns> nodes(block, q, task.nodes, task.size, task.columns, c);
+          const ParticleLanes<T> lanes(start + q, last, task.stencils.particles);
+          put<d>(lanes, nodes.gather(), c, nodes.used, task.columns, task.value, task.gradients, pass > 0);
         }
       }
-      block.join_last();
-      for (int64_t c = 0; c < task.columns; c += kLanes) {
-        const NodeRows<T, s, columns> rows(task.nodes, task.size, task.columns, c);
-        const int64_t at = c * particles + start;
-        gather_rows(block, rows, particles, task.columns, count, task.value + at, task.gradients + at, pass > 0);
+    }
+  }
+}
+
+template <class T, int d, int s, int columns_>
+void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
+  constexpr int columns = columns_ == 0 ? kLanes : columns_;
+  for (int64_t start = first; start < last; start += kBlock) {
+    const int count = smaller(last - start, kBlock);
+    Block<T, d, s> block, derivatives;
+    block.find_range(task.stencils, start, count);
+    block.evaluate(task.stencils, start, count);
+    derivatives.evaluate(task.stencils, start, count, ~0u);
+    for (int q = 0; q < count; q += kSimdLanes<T>) {
+      const ParticleLanes<T> lanes(start + q, last, task.stencils.particles);
+      for (int64_t c = 0; c < task.columns; c += columns) {
+        const Nodes<T, d, s, columns_> nodes(block, q, task.nodes, task.size, task.columns, c, &derivatives);
+        const GivenValues<T, d, columns> given(lanes, task, c, nodes.used);
+        const auto result = nodes.template sum<PullSums<T, d, s, columns>>(given);
+        by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
+          for (int a = 0; a < d; ++a) {
+            const Simd<T> before = c == 0 ? Simd<T>{} : lanes.template load<all>(task.by_offset, a);
+            lanes.template store<all>(task.by_offset, a, before + result.by[a + 1][0]);
+          }
+        });
+        if (task.value == nullptr) continue;
+        put<d>(lanes, result.gathered, c, nodes.used, task.columns, task.value, task.gradients);
       }
     }
   }
@@ -130,6 +282,13 @@ void gather(const Gather<T>& task, int64_t first, int64_t last) {
   if (task.columns == d) return gather_columns<T, d, s, d>(task, first, last);
   if (task.columns == d + 1) return gather_columns<T, d, s, d + 1>(task, first, last);
   gather_columns<T, d, s, 0>(task, first, last);
+}
+
+template <class T, int d, int s>
+void pull(const Pull<T>& task, int64_t first, int64_t last) {
+  if (task.columns == d) return pull_columns<T, d, s, d>(task, first, last);
+  if (task.columns == d + 1) return pull_columns<T, d, s, d + 1>(task, first, last);
+  pull_columns<T, d, s, 0>(task, first, last);
 }
 
 }  // namespace

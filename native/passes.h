@@ -1,12 +1,12 @@
-// What is done to the blocks of vectors from a first to a last: two combinations, what is left of a product, and the sums
-// that follow.
+// What is done to the blocks of vectors from a first to a last: two combinations, what is left of a product, and the
+// sums that follow.
 
 #pragma once
 
 #include <algorithm>
 #include <cstring>
 
-#include "vectors.h"
+#include "problems.h"
 
 namespace {
 

@@ -1,7 +1,7 @@
-// The sums, as plain data: arrays in C order with their sizes.
+// What is computed, as plain data: arrays in C order with their sizes, and the functions that do so for a batch.
 //
-// With the stencil weights w_ip and gradients g_ip,b of nodes i, particles p and directions b, values f at the nodes and
-// a, a_b at the particles,
+// With the stencil weights w_ip and gradients g_ip,b of nodes i, particles p and directions b, values f at the nodes
+// and a, a_b at the particles,
 //
 //   scatter  f_i  = Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b)
 //   gather   a_p  = Σ_i w_ip f_i,   a_p,b = Σ_i g_ip,b f_i
@@ -10,11 +10,18 @@
 //   resist   the scatter of K_p times the gather's gradients, with a symmetric matrix K_p for each particle
 //
 // Weights are products of one polynomial along each axis, of the particle's offset t; of a gradient's the one along its
-// direction is a slope. First nodes and offsets are given, (d, p) each, and the polynomials.
+// direction is a slope.
+//
+// Each problem lists its arrays once, in the order of XLA's operands and results: `arrays(f)` calls f(pointer, shape)
+// for all of them. `batch` problems follow each other in every array.
 
 #pragma once
 
 #include <cstdint>
+#include <initializer_list>
+#include <vector>
+
+#include "share.h"
 
 namespace mpmjax {
 
@@ -25,10 +32,24 @@ constexpr int kBlock = 16;                      // particles that are handled to
 constexpr int64_t kChunk = 64;                  // numbers of the nodes that are passed over together
 constexpr int64_t kCached = 1 << 21;            // bytes of an array that a cache may hold from one pass to the next
 
+inline int64_t blocks_of(int64_t numbers, int64_t each = kChunk) { return (numbers + each - 1) / each; }
+
+// The i-th problem of a batch.
+template <class Problem>
+Problem member(Problem all, int64_t i) {
+  all.arrays([&](auto& array, std::initializer_list<int64_t> shape) {
+    int64_t numbers = i;
+    for (const int64_t n : shape) numbers *= n;
+    if (array != nullptr) array += numbers;
+  });
+  return all;
+}
+
 // How nodes are numbered, and the polynomials. The i-th node along an axis, from a particle's first one on, has
 // Σ_k c_ik (t − τ_i)^k.
 template <class T>
 struct Basis {
+  int d, s;  // axes, and nodes along each: one to three, and two to four
   int32_t shape[kMostAxes], strides[kMostAxes];
   bool periodic[kMostAxes];  // whether after an axis' last node come its first ones
   int terms;                 // of each polynomial
@@ -38,29 +59,29 @@ struct Basis {
 
 template <class T>
 struct Stencils {
-  const int32_t* first;  // (d, p)
-  const T* offset;       // t, (d, p)
-  const T* change;       // dt, for the differential of a sum along it; null for the sum itself
+  const int32_t* first;
+  const T* offset;  // t
+  const T* change;  // dt, for the differential of a sum along it; null for the sum itself
   int64_t particles;
   Basis<T> basis;
-};
 
-template <class T>
-struct Gather {
-  Stencils<T> stencils;
-  const T* nodes;   // (n, c)
-  T* value;         // a, (c, p)
-  T* gradients;     // a_b for each direction, (d, c, p)
-  int64_t size;     // n
-  int64_t columns;  // c
+  template <class F>
+  void arrays(const F& f) {
+    f(first, {basis.d, particles}), f(offset, {basis.d, particles}), f(change, {basis.d, particles});
+  }
 };
 
 // What particles give in a scatter or a pull.
 template <class T>
 struct ParticleValues {
-  const T* value;      // a, (c, p), or null for zero
-  const T* gradients;  // a_b, (d, k, p), zero in columns from k on; or null for zero
+  const T* value;      // a, or null for zero
+  const T* gradients;  // a_b, zero in columns from k on; or null for zero
   int64_t graded;      // k
+
+  template <class F>
+  void arrays(const F& f, int64_t d, int64_t columns, int64_t particles) {
+    f(value, {columns, particles}), f(gradients, {d, graded, particles});
+  }
 };
 
 // The flat indices that a block of particles may reach.
@@ -69,15 +90,37 @@ struct Range {
 };
 
 template <class T>
+struct Gather {
+  Stencils<T> stencils;
+  const T* nodes;
+  T* value;         // a
+  T* gradients;     // a_b for each direction
+  int64_t size;     // number of nodes
+  int64_t columns;  // numbers of each
+
+  template <class F>
+  void arrays(const F& f) {
+    stencils.arrays(f), f(nodes, {size, columns});
+    f(value, {columns, stencils.particles}), f(gradients, {stencils.basis.d, columns, stencils.particles});
+  }
+};
+
+template <class T>
 struct Scatter {
   Stencils<T> stencils;
   ParticleValues<T> values;
-  T* nodes;             // (n, c)
+  T* nodes;
   const Range* ranges;  // of each block, or null
-  bool* reached;        // false, for each of the ⌈n/64⌉ blocks of nodes; or null, where nodes are few
+  bool* reached;        // false, for each block of kChunk nodes; or null, where nodes are few
   int64_t size;
   int64_t columns;
-  const bool* wanted;  // which of the nodes' ⌈n c/64⌉ blocks are, null for all; others may become anything
+  const bool* wanted;  // which blocks of kChunk numbers are, null for all; others may become anything
+
+  template <class F>
+  void arrays(const F& f) {
+    stencils.arrays(f), values.arrays(f, stencils.basis.d, columns, stencils.particles), f(nodes, {size, columns});
+    f(reached, {blocks_of(size)}), f(wanted, {blocks_of(size * columns)});
+  }
 };
 
 // Where the last column is not more than the least, all are zero.
@@ -86,46 +129,238 @@ struct Average {
   Stencils<T> stencils;
   ParticleValues<T> values;
   const T* least;
-  T* whole;             // the last column, (n)
-  T* means;             // the others divided by it, (n, c − 1)
-  T* sums;              // memory to work in, (n, c)
+  T* whole;             // the last column
+  T* means;             // the others divided by it
+  T* sums;              // memory to work in
   const Range* ranges;  // as in a scatter, and so the next
   bool* reached;
   int64_t size;
-  int64_t columns;  // c
+  int64_t columns;
+
+  template <class F>
+  void arrays(const F& f) {
+    stencils.arrays(f), f(least, {}), values.arrays(f, stencils.basis.d, columns, stencils.particles);
+    f(whole, {size}), f(means, {size, columns - 1}), f(sums, {size, columns}), f(reached, {blocks_of(size)});
+  }
 };
 
 template <class T>
 struct Pull {
   Stencils<T> stencils;
-  const T* nodes;     // (n, c)
+  const T* nodes;
   ParticleValues<T> values;
-  T* by_offset;       // (d, p)
-  T* value;           // the gather of the nodes, as in a gather; null where it is not wanted
+  T* by_offset;
+  T* value;  // the gather of the nodes, as in a gather; null where it is not wanted
   T* gradients;
   int64_t size;
   int64_t columns;
+
+  template <class F>
+  void arrays(const F& f) {
+    const int64_t d = stencils.basis.d, particles = stencils.particles;
+    stencils.arrays(f), f(nodes, {size, columns}), values.arrays(f, d, columns, particles);
+    f(by_offset, {d, particles}), f(value, {columns, particles}), f(gradients, {d, columns, particles});
+  }
 };
 
-// Σ_p Σ_b g_ip,b r_p,b with r_p = K_p G_p and G_p,b = Σ_j g_jp,b u_j, all in d columns. K_p is a symmetric matrix on the
-// d² components of a gradient, b first, given by its upper triangle, row by row.
+// Entries of a symmetric matrix on the d² components of a gradient, b first: its upper triangle, row by row.
+constexpr int64_t matrix_entries(int64_t d) { return d * d * (d * d + 1) / 2; }
+
+// Σ_p Σ_b g_ip,b r_p,b with r_p = K_p G_p and G_p,b = Σ_j g_jp,b u_j, all in d columns, and symmetric matrices K_p.
 template <class T>
 struct Resist {
   Stencils<T> stencils;
-  const T* matrices;    // K, (d² (d² + 1) / 2, p)
-  const T* moved;       // u, (n, d)
-  T* nodes;             // (n, d)
-  T* gradients;         // r_b for each direction, (d, d, p), where they are stored
+  const T* matrices;    // K
+  const T* moved;       // u
+  T* nodes;
+  T* gradients;         // r_b for each direction, where they are stored
   const Range* ranges;  // of each block, or null
   int64_t size;
-  int64_t columns;  // d
+  int64_t columns;     // d
   const bool* wanted;  // as in a scatter
+
+  template <class F>
+  void arrays(const F& f) {
+    stencils.arrays(f), f(matrices, {matrix_entries(columns), stencils.particles});
+    f(moved, {size, columns}), f(nodes, {size, columns});
+    f(gradients, {columns, columns, stencils.particles}), f(wanted, {blocks_of(size * columns)});
+  }
 };
 
-// The sums for one dimension and kernel. Those of d and d + 1 columns, vectors at the nodes without and with a mass, have
-// code of their own; others are summed in four columns at a time. Gather and pull take particles from a first to a last.
-// Others take all particles, and set the nodes from a first to a last; they pass over blocks whose range of indices says
-// that they give nothing to these. `resist_particles` stores what the particles from a first to a last give.
+// A solve by the conjugate residual method: W⁻¹A x = W⁻¹b, with A = M + χH on free components and the identity on
+// others, and H the resistance of the particles. The recurrence begins at `start`, and again from the true residual
+// where it ends, until ‖r‖ is within its tolerance, has not halved, or steps are used up.
+constexpr int kTolerances = 3, kOutcome = 9, kVectors = 6;
+
+template <class T>
+struct Solve {
+  Stencils<T> stencils;
+  const T* matrices;   // K, as in a resistance
+  const T* mass;       // M, of each node
+  const T* factor;     // χ
+  const bool* free;
+  const T* weight;     // W
+  const bool* active;  // for each block of kChunk components, as in a combination
+  const T* start;      // where x starts, which may lie where x does
+  const T* rhs;        // W⁻¹b; zero wherever nothing is active
+  const T* limits;     // ‖r‖/‖W⁻¹b‖ to reach; most steps; part of ‖r‖² at a start that is the recurrence's floor
+  T* x;
+  // ‖r‖², steps, largest |rᵀA r|/‖r‖², whether rᵀA r vanished, whether it was negative, the change of x by the last
+  // recurrence, whether that has not halved ‖r‖, ‖W⁻¹b‖, and ‖x‖, all in the norm of W.
+  T* numbers;
+  T* memory;  // to work in
+  int64_t nodes, columns;
+  int64_t room;  // numbers in `memory`: kVectors times those of x, or none where each problem takes its own
+
+  template <class F>
+  void arrays(const F& f) {
+    const int64_t size = nodes * columns;
+    stencils.arrays(f), f(matrices, {matrix_entries(columns), stencils.particles});
+    f(mass, {nodes}), f(factor, {}), f(free, {size}), f(weight, {size}), f(active, {blocks_of(size)});
+    f(start, {size}), f(rhs, {size}), f(limits, {kTolerances}), f(x, {size}), f(numbers, {kOutcome}), f(memory, {room});
+  }
+};
+
+// y = a + s_0 b, z = c + s_1 d and Σ w z². Where `active` is false, all of a, b, c and d are zero. A result may be what
+// one of its two vectors was.
+template <class T>
+struct Combine {
+  const T *a, *b, *c, *d;
+  const T* scales;  // s_0, s_1
+  const T* weight;
+  const bool* active;  // for each block of kChunk numbers
+  T *y, *z, *sum;
+  int64_t size;
+
+  template <class F>
+  void arrays(const F& f) {
+    f(a, {size}), f(b, {size}), f(c, {size}), f(d, {size}), f(scales, {2}), f(weight, {size});
+    f(active, {blocks_of(size)}), f(y, {size}), f(z, {size}), f(sum, {});
+  }
+};
+
+// What is left of a product with A = M + χH on free components, once the force f = H v is known: the image y = W⁻¹A v,
+// with (A v)_i = m_i v_i + χ f_i where i is free and v_i elsewhere, and Σ v (A v). Where `active` is false v is zero,
+// and nothing free; the image is zero there if it is `whole`, and else left as it was. It may be where the force was.
+template <class T>
+struct Product {
+  const T *force, *v;
+  const T* mass;    // of each node, that of size/nodes components
+  const T* factor;  // χ
+  const bool* free;
+  const T* weight;
+  const bool* active;
+  T *image, *sum;
+  int64_t size, nodes;
+  bool whole;
+
+  template <class F>
+  void arrays(const F& f) {
+    f(force, {size}), f(v, {size}), f(mass, {nodes}), f(factor, {}), f(free, {size}), f(weight, {size});
+    f(active, {blocks_of(size)}), f(image, {size}), f(sum, {});
+  }
+};
+
+// S = V diag(w) Vᵀ of symmetric 3 x 3 matrices, of which only the upper triangle is read. Eigenvalues have no order,
+// det V = 1.
+template <class T>
+struct Eigen {
+  const T* matrices;  // S
+  T* values;          // w
+  T* vectors;         // V
+  int64_t particles;
+
+  template <class F>
+  void arrays(const F& f) {
+    f(matrices, {3, 3, particles}), f(values, {3, particles}), f(vectors, {3, 3, particles});
+  }
+};
+
+// The rotation R of F = R S, which maximises tr(RᵀF), of 3 x 3 matrices.
+template <class T>
+struct Rotation {
+  const T* matrices;  // F
+  T* rotations;       // R
+  int64_t particles;
+
+  template <class F>
+  void arrays(const F& f) {
+    f(matrices, {3, 3, particles}), f(rotations, {3, 3, particles});
+  }
+};
+
+// The order of numbers from the least to the largest, where equal ones keep theirs.
+struct Order {
+  const int32_t* keys;
+  int32_t* order;  // the number of the key that is the least, of the next one, ...
+  int64_t count;
+
+  template <class F>
+  void arrays(const F& f) {
+    f(keys, {count}), f(order, {count});
+  }
+};
+
+// Numbers of particles in another order of these, or as they are where it is not wanted. They may come from and go to
+// the same memory.
+template <class T>
+struct Rearrangement {
+  const bool* wanted;
+  const int32_t* order;  // what comes k-th is of particle order[k]; with `inverse` what comes order[k]-th of the k-th
+  const T* from;
+  T* to;
+  int64_t rows, count;
+  bool inverse;
+
+  template <class F>
+  void arrays(const F& f) {
+    f(wanted, {}), f(order, {count}), f(from, {rows, count}), f(to, {rows, count});
+  }
+};
+
+// The nodes of each member cut into parts, one for each thread, and the ranges of nodes that its blocks of particles
+// reach. Where there is one part there are none, unless they are wanted.
+struct Division {
+  int64_t parts, blocks;
+  std::vector<Range> ranges;
+  std::vector<std::vector<int64_t>> cuts;
+};
+
+// Of a batch, on all threads of a pool, for float and double. Results have the same bits for any number of threads.
+template <class T>
+void gather(const Pool& pool, int64_t batch, const Gather<T>& first);
+template <class T>
+void scatter(const Pool& pool, int64_t batch, const Scatter<T>& first);
+template <class T>
+void average(const Pool& pool, int64_t batch, const Average<T>& first);
+template <class T>
+void pull(const Pool& pool, int64_t batch, const Pull<T>& first);
+// The division of a resistance, which its particles' places alone decide, and the resistance with one found before.
+template <class T>
+Division divided(const Pool& pool, int64_t batch, const Resist<T>& first);
+template <class T>
+void resist(const Pool& pool, int64_t batch, const Resist<T>& first, const Division& division);
+// Each ends by itself. As many as there are threads or more are shared among them whole, each with its arrays in the
+// cache of one core; fewer are done one by one by all threads.
+template <class T>
+void solve(const Pool& pool, int64_t batch, const Solve<T>& first);
+template <class T>
+void combine(const Pool& pool, int64_t batch, const Combine<T>& first);
+template <class T>
+void product(const Pool& pool, int64_t batch, const Product<T>& first);
+template <class T>
+void eigen(const Pool& pool, int64_t batch, const Eigen<T>& first);
+template <class T>
+void rotation(const Pool& pool, int64_t batch, const Rotation<T>& first);
+void order(const Pool& pool, int64_t batch, const Order& first);
+template <class T>
+void rearrange(const Pool& pool, int64_t batch, const Rearrangement<T>& first);
+
+// The sums for one dimension and kernel. Those of d and d + 1 columns, vectors at the nodes without and with a mass,
+// have code of their own; others are summed in four columns at a time. Gather and pull take particles from a first to a
+// last. Others take all particles, and set the nodes from a first to a last; they pass over blocks whose range of
+// indices says that they give nothing to these. `resist_particles` stores what the particles from a first to a last
+// give.
 template <class T>
 struct Kernels {
   void (*gather)(const Gather<T>&, int64_t first, int64_t last);
@@ -136,5 +371,23 @@ struct Kernels {
   void (*resist)(const Resist<T>&, int64_t first, int64_t last);
   void (*resist_particles)(const Resist<T>&, int64_t first, int64_t last);
 };
+
+// All kernels for numbers of one type. Decompositions are of particles' matrices from a first to a last; passes over
+// blocks of vectors return their sum.
+template <class T>
+struct KernelSet {
+  const Kernels<T>* (*sums)(int d, int s);
+  void (*eigen)(const Eigen<T>&, int64_t first, int64_t last);
+  void (*rotation)(const Rotation<T>&, int64_t first, int64_t last);
+  double (*combine)(const Combine<T>&, int64_t first, int64_t last);
+  double (*product)(const Product<T>&, int64_t first, int64_t last);
+};
+
+// The kernels of the best instruction set that this machine has, of those that they are compiled for.
+template <class T>
+const KernelSet<T>& kernels();
+
+// The name of the instruction set; empty where this machine has none of them, and then no kernel may be called.
+const char* instructions();
 
 }  // namespace mpmjax

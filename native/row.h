@@ -1,7 +1,7 @@
 // Rows: what the nodes of a stencil along the last axis have, some columns at each.
 //
-// These nodes follow each other in memory, so that several make one vector. A sum over a stencil's nodes is then one over
-// its rows, and only at one end of it over the nodes of a row.
+// These nodes follow each other in memory, so that several make one vector. A sum over a stencil's nodes is then one
+// over its rows, and only at one end of it over the nodes of a row.
 
 #pragma once
 
@@ -27,9 +27,10 @@ struct Row {
   static constexpr int count = (s + together - 1) / together;
   static constexpr int lanes = power_of_two(together * columns);
 
-  using Number = T;
-  typedef T Part __attribute__((vector_size(lanes * sizeof(T))));
-  typedef typename LanesOf<T, lanes>::type Mask;
+  using Part = typename VectorOf<T, lanes>::type;
+  using Mask = LanesOf<T, lanes>;
+  // Four numbers, read with as many of those that follow them as a part has.
+  using Four = typename VectorOf<T, (lanes > kLanes ? lanes : kLanes)>::type;
   Part parts[count];
 
   // The node that a lane of a part belongs to, or -1.
@@ -43,33 +44,27 @@ struct Row {
 
   // How many numbers the parts reach over, where each node has so many.
   static constexpr int64_t reach(int64_t stride) { return (count - 1) * together * stride + lanes; }
+
+  template <class F>
+  static MPMJAX_INLINE Row of(const F& part) {
+    Row row;
+    each<count>([&](auto k) MPMJAX_INLINE_LAMBDA { row.parts[k] = part(k); });
+    return row;
+  }
+  friend MPMJAX_INLINE Row operator*(T a, const Row& x) {
+    return of([&](int k) MPMJAX_INLINE_LAMBDA { return a * x.parts[k]; });
+  }
+  friend MPMJAX_INLINE Row operator*(const Row& a, const Row& x) {
+    return of([&](int k) MPMJAX_INLINE_LAMBDA { return a.parts[k] * x.parts[k]; });
+  }
+  friend MPMJAX_INLINE Row operator+(const Row& a, const Row& b) {
+    return of([&](int k) MPMJAX_INLINE_LAMBDA { return a.parts[k] + b.parts[k]; });
+  }
 };
 
 // All columns of the nodes, or where their number is 0 when this is compiled, four of any number.
 template <class T, int s, int columns>
 using RowOf = Row<T, s, columns == 0 ? kLanes : columns, columns == 0 ? 1 : fitting<T>(s, columns)>;
-
-template <class R, class F>
-MPMJAX_INLINE R row_of(const F& part) {
-  R row;
-  each<R::count, true>([&](auto k) MPMJAX_INLINE_LAMBDA { row.parts[k] = part(k); });
-  return row;
-}
-
-template <class T, int s, int c, int t>
-MPMJAX_INLINE Row<T, s, c, t> product(T a, Row<T, s, c, t> x) {
-  return row_of<Row<T, s, c, t>>([&](int k) MPMJAX_INLINE_LAMBDA { return a * x.parts[k]; });
-}
-
-template <class T, int s, int c, int t>
-MPMJAX_INLINE Row<T, s, c, t> product(Row<T, s, c, t> a, Row<T, s, c, t> x) {
-  return row_of<Row<T, s, c, t>>([&](int k) MPMJAX_INLINE_LAMBDA { return a.parts[k] * x.parts[k]; });
-}
-
-template <class T, int s, int c, int t>
-MPMJAX_INLINE Row<T, s, c, t> operator+(Row<T, s, c, t> a, Row<T, s, c, t> b) {
-  return row_of<Row<T, s, c, t>>([&](int k) MPMJAX_INLINE_LAMBDA { return a.parts[k] + b.parts[k]; });
-}
 
 // A vector of chosen lanes of another; where the number of a lane is -1 it holds anything.
 template <class V, class From, int... lane>
@@ -94,8 +89,7 @@ MPMJAX_INLINE V shuffled(V a, V b, M, std::integer_sequence<int, lane...>) {
 template <int count>
 using Count = std::make_integer_sequence<int, count>;
 
-// For the lanes of a part, their nodes and their columns; and the lanes of a part that its i-th node has, four with what
-// is beyond its columns.
+// For the lanes of a part, their nodes and their columns.
 template <class R, int part, int... lane>
 constexpr auto nodes_of(std::integer_sequence<int, lane...>) {
   return std::integer_sequence<int, R::node(part, lane)...>();
@@ -104,53 +98,21 @@ template <class R, int... lane>
 constexpr auto columns_of(std::integer_sequence<int, lane...>) {
   return std::integer_sequence<int, (lane < R::together * R::columns ? lane % R::columns : -1)...>();
 }
-template <class R, int i, int... lane>
-constexpr auto lanes_of(std::integer_sequence<int, lane...>) {
-  return std::integer_sequence<int, (lane < R::columns ? i * R::columns + lane : -1)...>();
-}
-
-// Four numbers, read with as many of those that follow them as a part has.
-template <class R>
-struct FourFor {
-  static constexpr int lanes = R::lanes > kLanes ? R::lanes : kLanes;
-  typedef typename R::Number type __attribute__((vector_size(lanes * sizeof(typename R::Number))));
-};
-template <class R, class T>
-MPMJAX_INLINE auto read_four(const Vector<T>& first) {
-  typename FourFor<R>::type four;
-  std::memcpy(&four, &first, sizeof four);
-  return four;
-}
 
 // A row that has at each node its own of four numbers, in all columns.
-template <class R, class T>
-MPMJAX_INLINE R by_node(const Vector<T>& first) {
-  const auto four = read_four<R, T>(first);
-  return row_of<R>([&](auto k) MPMJAX_INLINE_LAMBDA {
+template <class R, class Four>
+MPMJAX_INLINE R by_node(const Four& first) {
+  const auto four = load_as<typename R::Four>(&first);
+  return R::of([&](auto k) MPMJAX_INLINE_LAMBDA {
     return shuffled<typename R::Part>(four, nodes_of<R, decltype(k)::value>(Count<R::lanes>()));
   });
 }
 
 // A row that has the same columns at each node.
-template <class R, class T>
-MPMJAX_INLINE R at_each(const Vector<T>& first) {
-  const auto part = shuffled<typename R::Part>(read_four<R, T>(first), columns_of<R>(Count<R::lanes>()));
-  return row_of<R>([&](int) MPMJAX_INLINE_LAMBDA { return part; });
-}
-
-// The columns of the i-th node in four lanes, of which others hold anything.
-template <int i, class R>
-MPMJAX_INLINE auto columns_at(const R& row) {
-  constexpr int part = i / R::together, place = i % R::together;
-  return shuffled<Vector<typename R::Number>>(row.parts[part], lanes_of<R, place>(Count<kLanes>()));
-}
-
-// The sum of these over the nodes.
-template <class R>
-MPMJAX_INLINE auto sum(const R& row) {
-  auto total = columns_at<0>(row);
-  each<R::s - 1, true>([&](auto i) MPMJAX_INLINE_LAMBDA { total += columns_at<decltype(i)::value + 1>(row); });
-  return total;
+template <class R, class Four>
+MPMJAX_INLINE R at_each(const Four& first) {
+  const auto part = shuffled<typename R::Part>(load_as<typename R::Four>(&first), columns_of<R>(Count<R::lanes>()));
+  return R::of([&](int) MPMJAX_INLINE_LAMBDA { return part; });
 }
 
 // Which lanes belong to a node and to the first so many of its columns.
@@ -168,7 +130,7 @@ struct LaneMask {
 
   // Zero in all other lanes.
   MPMJAX_INLINE R of(const R& row) const {
-    return row_of<R>([&](int k) MPMJAX_INLINE_LAMBDA {
+    return R::of([&](int k) MPMJAX_INLINE_LAMBDA {
       return (typename R::Part)((typename R::Mask)row.parts[k] & lanes[k]);
     });
   }

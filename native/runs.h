@@ -1,11 +1,10 @@
-// Runs: particles abreast that follow one another along the last axis of the grid, so that one row of nodes has what all
-// of them read. It is read once, and each lane takes its nodes from it by a permutation.
+// Runs: particles abreast that follow one another along the last axis of the grid, so that one row of nodes has what
+// all of them read. It is read once, and each lane takes its nodes from it by a permutation.
 //
 // So lie the particles of a lattice, and those that were sorted by cell.
 
 #pragma once
 
-#include "simd.h"
 #include "block.h"
 #if defined(__AVX2__)
 #include <immintrin.h>
@@ -36,10 +35,10 @@ MPMJAX_INLINE Simd<T> permuted(Simd<T> v, M lanes) {
 
 // A bit for each lane where a comparison holds.
 #if defined(__AVX512F__)
-MPMJAX_INLINE uint32_t bits(LanesOf<float, 16>::type where) { return _mm512_movepi32_mask((__m512i)where); }
+MPMJAX_INLINE uint32_t bits(LanesOf<float, 16> where) { return _mm512_movepi32_mask((__m512i)where); }
 #endif
 #if defined(__AVX2__)
-MPMJAX_INLINE uint32_t bits(LanesOf<float, 8>::type where) { return _mm256_movemask_ps((__m256)where); }
+MPMJAX_INLINE uint32_t bits(LanesOf<float, 8> where) { return _mm256_movemask_ps((__m256)where); }
 #endif
 
 // For column c of nodes that lie in several vectors one after the other: what a lane takes where the first `part` of
@@ -60,56 +59,45 @@ MPMJAX_INLINE Simd<T> column_of(const Simd<T>* parts, Simd<T> joined) {
     return joined;
   } else {
     constexpr int lanes = kSimdLanes<T>;
-    const auto next = shuffled(joined, parts[part], typename LanesOf<T, lanes>::type(),
+    const auto next = shuffled(joined, parts[part], LanesOf<T, lanes>(),
                              taken_of<columns, c, part>(Count<lanes>()));
     return column_of<T, columns, c, part + 1>(parts, next);
   }
 }
 
-// The nodes along the last axis, with all their columns.
+// The nodes along the last axis with all their columns, for a particle in each lane.
 template <class T, int s, int columns>
-struct Field {
-  using V = Simd<T>;
+struct NodeRow {
   static constexpr int numbers = s * columns;
-  static constexpr int reach = (numbers + kLanes - 1) / kLanes * kLanes;  // how many are read at once
-  V at[numbers];
-
-  template <class F>
-  static MPMJAX_INLINE Field of(const F& number) {
-    Field field;
-#pragma GCC unroll 16
-    for (int k = 0; k < numbers; ++k) field.at[k] = number(k);
-    return field;
-  }
+  Simd<T> at[numbers];
 };
 
 // The runs among some particles of a block.
 template <class T, int d, int s, int columns>
 class Runs {
  public:
-  // Finds the runs of the particles of a block from the q-th on, which all lie within the window. Rows are read from one
-  // node before a run's first particle on. Returns false where runs are many, or so near an end of the window that a row
-  // would reach beyond it.
+  // Finds the runs of the particles of a block from the q-th on, which all lie within the window. Rows are read from
+  // one node before a run's first particle on. Returns false where runs are many, or so near an end of the window that
+  // a row would reach beyond it.
   MPMJAX_INLINE bool find(const Block<T, d, s>& block, int q, int64_t size) {
     Index apart = {};  // not zero where the rows are not those of the particle before
     for (int a = 0; a < last; ++a) {
       for (int i = 0; i < s; ++i) {
-        const Index index_terms = read(block.index[a][i] + q);
-        apart |= index_terms ^ shuffled<Index>(index_terms, before_of(Count<lanes>()));
+        const Index terms = load_as<Index>(block.index[a][i] + q);
+        apart |= terms ^ shuffled<Index>(terms, before_of(Count<lanes>()));
       }
     }
     const int32_t* place = block.index[last][0] + q;
-    const Index index_terms = read(place);
+    const Index terms = load_as<Index>(place);
     const int32_t end = static_cast<int32_t>(std::min<int64_t>(size, INT32_MAX)) - lanes + s;
-    const uint32_t near = bits((read(block.least + q) < 1) | (read(block.most + q) > end));
+    const uint32_t near = bits((load_as<Index>(block.least + q) < 1) | (load_as<Index>(block.most + q) > end));
     const uint32_t turns = bits(apart != 0);
     for (int e = 0; e < lanes; ++e) number_[e] = e;
     count_ = 0;
     for (int first = 0; first < lanes && near == 0; ++count_) {
       if (count_ == kMost) return false;
-      const int32_t least = place[first] - 1;
-      const Index from = index_terms - least;
-      runs_[count_] = {first, least};
+      const Index from = terms - (place[first] - 1);
+      first_[count_] = first;
       place_[count_] = __builtin_convertvector(from, Lane);
       const uint32_t ends = (turns | bits((from < 0) | (from > lanes - s))) & (~uint32_t(1) << first);
       first = ends == 0 ? lanes : __builtin_ctz(ends);
@@ -118,53 +106,39 @@ class Runs {
   }
 
   // The nodes that the particles read in row i, in C order of the axes before the last.
-  MPMJAX_INLINE Field<T, s, columns> row(const Block<T, d, s>& block, int q, const T* nodes, int i) const {
-    Field<T, s, columns> field;
-    read_run(block, q, nodes, i, 0, [&](int k, Simd<T> v) MPMJAX_INLINE_LAMBDA { field.at[k] = v; });
+  MPMJAX_INLINE NodeRow<T, s, columns> row(const Block<T, d, s>& block, int q, const T* nodes, int i) const {
+    NodeRow<T, s, columns> row;
+    read_run(block, q, nodes, i, 0, [&](int k, Simd<T> v) MPMJAX_INLINE_LAMBDA { row.at[k] = v; });
     for (int r = 1; r < count_; ++r) {
-      const Lane meant = number_ >= runs_[r].first;
+      const Lane meant = number_ >= first_[r];
       read_run(block, q, nodes, i, r, [&](int k, Simd<T> v) MPMJAX_INLINE_LAMBDA {
-        field.at[k] = meant ? v : field.at[k];
+        row.at[k] = meant ? v : row.at[k];
       });
     }
-    return field;
+    return row;
   }
 
  private:
   static constexpr int lanes = kSimdLanes<T>, last = d - 1, kMost = 4;
-  using Lane = typename LanesOf<T, lanes>::type;
-  using Index = typename LanesOf<float, lanes>::type;
+  using Lane = LanesOf<T, lanes>;
+  using Index = LanesOf<float, lanes>;
 
   // Calls put(k, number) for each number k of a row of the nodes that a run reads, in all lanes.
   template <class Put>
   MPMJAX_INLINE void read_run(const Block<T, d, s>& block, int q, const T* nodes, int i, int r,
                               const Put& put) const {
-    const Run& run = runs_[r];
-    int64_t index = run.least;
-    if constexpr (d == 2) index += block.index[0][i][q + run.first];
-    if constexpr (d == 3) index += block.index[0][i / s][q + run.first] + block.index[1][i % s][q + run.first];
+    const int64_t index = block.node(i, q + first_[r]) - 1;
     Simd<T> parts[columns];
 #pragma GCC unroll 4
     for (int m = 0; m < columns; ++m) std::memcpy(&parts[m], nodes + index * columns + m * lanes, sizeof parts[m]);
-    each<columns, true>([&](auto c) MPMJAX_INLINE_LAMBDA {
+    each<columns>([&](auto c) MPMJAX_INLINE_LAMBDA {
       const auto column = column_of<T, columns, decltype(c)::value>(parts, parts[0]);
 #pragma GCC unroll 4
       for (int j = 0; j < s; ++j) put(j * columns + c, permuted<T>(column, place_[r] + j));
     });
   }
 
-  static MPMJAX_INLINE Index read(const int32_t* from) {
-    Index index;
-    std::memcpy(&index, from, sizeof index);
-    return index;
-  }
-
-  // From which lane on, and the first node of its row along the last axis.
-  struct Run {
-    int first;
-    int32_t least;
-  };
-  Run runs_[kMost];
+  int first_[kMost];  // from which lane on each is
   int count_;
   Lane number_, place_[kMost];  // of each lane, and for each run its first node in the row
 };

@@ -1,16 +1,106 @@
-// The scatter: f_i = Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b).
+// The scatter, f_i = Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b), and the average: m_i, the last column of a scatter, and its
+// other columns divided by m_i, where m_i is more than a least.
 //
 // It sets the nodes of a range, from all particles in their order; those of a block that follow each other and have the
 // same nodes are added up first. Ranges of different threads share no node, so there is no race and nothing to add up
-// afterwards, and the sums have the same bits however the nodes are divided.
+// afterwards, and the sums have the same bits however the nodes are divided. Blocks of nodes that no particle reaches
+// are set to zero and not looked at.
 
 #pragma once
 
-#include "reach.h"
+#include "block.h"
+#if defined(__SSE2__)
+#include <emmintrin.h>
+#endif
 
 namespace {
 
+using mpmjax::Average;
+using mpmjax::kChunk;
+using mpmjax::Range;
 using mpmjax::Scatter;
+
+// Numbers from a first to before a last become zero, or of these only the blocks that are wanted.
+template <class T>
+void clear(T* numbers, const bool* wanted, int64_t first, int64_t last) {
+  if (wanted == nullptr) {
+    std::memset(numbers + first, 0, static_cast<size_t>(last - first) * sizeof(T));
+    return;
+  }
+  for (int64_t end, i = first; i < last; i = end) {
+    end = (i / kChunk + 1) * kChunk;
+    end = end < last ? end : last;
+    if (wanted[i / kChunk]) std::memset(numbers + i, 0, static_cast<size_t>(end - i) * sizeof(T));
+  }
+}
+
+// The same of numbers in an array that is too large for a cache, and which nobody reads soon: they are written past the
+// caches, which takes half as long. A cache would first read what is there.
+template <class T>
+MPMJAX_NOINLINE void stream(T* numbers, int64_t first, int64_t last) {
+#if defined(__SSE2__)
+  constexpr int64_t kLine = 64, each = kLine / sizeof(T), quarter = each / 4;
+  const int64_t into = static_cast<int64_t>(reinterpret_cast<uintptr_t>(numbers + first) % kLine / sizeof(T));
+  const int64_t aligned = into == 0 ? first : first + each - into;
+  if (aligned + each <= last) {
+    clear(numbers, nullptr, first, aligned);
+    for (first = aligned; first + each <= last; first += each) {
+      for (int64_t i = 0; i < each; i += quarter) {
+        _mm_stream_si128(reinterpret_cast<__m128i*>(numbers + first + i), _mm_setzero_si128());
+      }
+    }
+    _mm_sfence();
+  }
+#endif
+  clear(numbers, nullptr, first, last);
+}
+
+// Zeros from a first to before a last of so many numbers, which nobody reads soon.
+template <class T>
+void wipe(T* numbers, int64_t size, int64_t first, int64_t last) {
+  if (size * static_cast<int64_t>(sizeof(T)) > mpmjax::kCached) {
+    stream(numbers, first, last);
+  } else {
+    clear(numbers, nullptr, first, last);
+  }
+}
+
+// Marks the blocks of kChunk nodes, of a range from a first to before a last, that particles reach. Those of a block
+// of particles reach, for each index of the first axis, from the least to the most that the axes after it add.
+template <class T, int d, int s>
+void mark(const Stencils<T>& stencils, const Range* ranges, bool* reached, int64_t first, int64_t last) {
+  for (int64_t start = 0; start < stencils.particles; start += kBlock) {
+    const Range range = ranges[start / kBlock];
+    if (range.most < first || range.least >= last) continue;
+    const int count = smaller(stencils.particles - start, kBlock);
+    Block<T, d, s> block;
+    block.find_range(stencils, start, count);
+    const int64_t least = *std::min_element(block.least_beyond, block.least_beyond + count);
+    const int64_t most = *std::max_element(block.most_beyond, block.most_beyond + count);
+    for (int i = 0; i < s; ++i) {
+      for (int q = 0; q < count; ++q) {
+        const int64_t term = block.index[0][i][q];
+        if (q > 0 && term == block.index[0][i][q - 1]) continue;
+        const int64_t from = std::max(term + least, first), to = std::min(term + most, last - 1);
+        for (int64_t k = from / kChunk; from <= to && k <= to / kChunk; ++k) reached[k] = true;
+      }
+    }
+  }
+}
+
+// Calls run(whether they are reached, first, last) for nodes of a range, as many together as are alike. Where there
+// are no marks, all count as reached.
+template <class Run>
+void over_reached(const bool* reached, int64_t first, int64_t last, const Run& run) {
+  if (reached == nullptr) return run(true, first, last);
+  for (int64_t end, start = first; start < last; start = end) {
+    const bool alike = reached[start / kChunk];
+    int64_t k = start / kChunk + 1;
+    while (k * kChunk < last && reached[k] == alike) ++k;
+    end = k * kChunk < last ? k * kChunk : last;
+    run(alike, start, end);
+  }
+}
 
 // Columns of the nodes from a first to a last one: all columns, or where `columns` is 0 up to four.
 template <class T, int s, int columns>
@@ -40,28 +130,22 @@ struct NodeSums {
            (block.most[q] - (s - 1)) * stride() + R::reach(stride()) <= extent;
   }
 
-  // Adds to the row whose index along the axes before the last adds up to `first`.
+  // Adds to the row of a particle.
   template <bool inside, class B>
-  MPMJAX_INLINE void add(const B& block, int q, int32_t first, const R& row) const {
-    constexpr int axis = B::axes - 1;
-    const int32_t node = wrapping_sum(first, block.index[axis][0][q]);
+  MPMJAX_INLINE void add(const B& block, int row, int q, const R& numbers) const {
+    const int32_t node = block.node(row, q);
     if (inside || (block.contiguous[q] && holds_row(node))) {
       T* to = nodes + node * stride();
-      const R added = present.of(row);
-      // All is read before anything is written: a part's last lanes may be the next one's first, which writes them last.
-      const R sums = row_of<R>([&](int k) MPMJAX_INLINE_LAMBDA {
-        typename R::Part result;
-        std::memcpy(&result, to + k * R::together * stride(), sizeof result);
-        return result + added.parts[k];
+      const R added = present.of(numbers);
+      // All is read before anything is written: a part's last lanes may be the next one's first, which writes them
+      // last.
+      const R sums = R::of([&](int k) MPMJAX_INLINE_LAMBDA {
+        return load_as<typename R::Part>(to + k * R::together * stride()) + added.parts[k];
       });
-      each<R::count, true>([&](int k) MPMJAX_INLINE_LAMBDA {
-        std::memcpy(to + k * R::together * stride(), &sums.parts[k], sizeof(typename R::Part));
-      });
+      each<R::count>([&](int k) MPMJAX_INLINE_LAMBDA { store(to + k * R::together * stride(), sums.parts[k]); });
     } else {
-      int32_t index[s];
-      for (int i = 0; i < s; ++i) index[i] = wrapping_sum(first, block.index[axis][i][q]);
-      const R apart = row;  // so that the row itself needs no place in memory
-      add_apart(index, apart);
+      const R apart = numbers;  // so that the numbers themselves need no place in memory
+      add_apart(block, row, q, apart);
     }
   }
 
@@ -71,20 +155,21 @@ struct NodeSums {
   }
 
   // Adds to any nodes, of which those beyond the range are passed over.
-  MPMJAX_NOINLINE void add_apart(const int32_t* index, const R& row) const {
+  template <class B>
+  MPMJAX_NOINLINE void add_apart(const B& block, int row, int q, const R& added) const {
     alignas(R) T numbers[R::count * R::lanes];
-    std::memcpy(numbers, &row, sizeof row);
-    for (int i = 0; i < s; ++i) {
-      if (index[i] < first || index[i] >= last) continue;
-      T* to = nodes + index[i] * stride();
-      for (int c = 0; c < used; ++c) to[c] += numbers[R::place(i) + c];
+    std::memcpy(numbers, &added, sizeof added);
+    for (int j = 0; j < s; ++j) {
+      const int32_t node = block.node(row, q, j);
+      if (node < first || node >= last) continue;
+      for (int c = 0; c < used; ++c) nodes[node * stride() + c] += numbers[R::place(j) + c];
     }
   }
 };
 
-// What particles with the same nodes give to all rows, in C order of the axes before the last. Gradients are those of the
-// axes from a on, without the last.
-template <class T, int d, int s, int columns>
+// What particles with the same nodes give to all rows, in C order of the axes before the last. Gradients are those of
+// the axes from a on, without the last.
+template <class T, int d, int s, bool graded, int columns>
 struct Scatterer {
   using R = RowOf<T, s, columns>;
   static constexpr int last = d - 1, rows = power(s, last);
@@ -92,18 +177,15 @@ struct Scatterer {
   const Block<T, d, s>& block;
   R sums[rows] = {};
 
-  // With gradients: the particle's rows of four. The last axis is the first to be multiplied by, within the row.
-  MPMJAX_INLINE void add_graded(int q, const Vector<T> (*values)[kRoom]) {
-    const R w = block.template last_weight<R>(q), g = block.template last_slope<R>(q);
-    const R value = product(w, at_each<R, T>(values[0][q])) + product(g, at_each<R, T>(values[d][q]));
-    R gradients[d];
-    for (int b = 0; b < last; ++b) gradients[b] = product(w, at_each<R, T>(values[b + 1][q]));
+  // Adds a particle's rows of four. The last axis is the first to be multiplied by, within the row.
+  MPMJAX_INLINE void add(int q, const Vector<T> (*values)[kRoom]) {
+    const R w = by_node<R>(block.last_weights[q]);
+    R value = w * at_each<R>(values[0][q]), gradients[d];
+    if constexpr (graded) {
+      value = value + by_node<R>(block.last_slopes[q]) * at_each<R>(values[d][q]);
+      for (int b = 0; b < last; ++b) gradients[b] = w * at_each<R>(values[b + 1][q]);
+    }
     add<0>(q, 0, value, gradients);
-  }
-
-  // Without.
-  MPMJAX_INLINE void add_value(int q, const Vector<T> (*values)[kRoom]) {
-    add<0>(q, 0, product(block.template last_weight<R>(q), at_each<R, T>(values[0][q])));
   }
 
   // One step further in: the same times the factors of one node along axis a.
@@ -112,26 +194,17 @@ struct Scatterer {
     if constexpr (a == last) {
       sums[row] = sums[row] + value;
     } else {
-      each<s, true>([&](int i) MPMJAX_INLINE_LAMBDA {
+      each<s>([&](int i) MPMJAX_INLINE_LAMBDA {
         const T w = block.weights[a][i][q], g = block.slopes[a][i][q];
-        if constexpr (a + 1 == last) {  // so that both products are added as they are formed
-          sums[s * row + i] = sums[s * row + i] + product(w, value) + product(g, gradients[0]);
+        R inner[d - a];
+        if constexpr (!graded) {
+          add<a + 1>(q, s * row + i, w * value, inner);
+        } else if constexpr (a + 1 == last) {  // so that both products are added as they are formed
+          sums[s * row + i] = sums[s * row + i] + w * value + g * gradients[0];
         } else {
-          R inner[d - a];
-          for (int b = 1; b < last - a; ++b) inner[b - 1] = product(w, gradients[b]);
-          add<a + 1>(q, s * row + i, product(w, value) + product(g, gradients[0]), inner);
+          for (int b = 1; b < last - a; ++b) inner[b - 1] = w * gradients[b];
+          add<a + 1>(q, s * row + i, w * value + g * gradients[0], inner);
         }
-      });
-    }
-  }
-
-  template <int a>
-  MPMJAX_INLINE void add(int q, int row, R value) {
-    if constexpr (a == last) {
-      sums[row] = sums[row] + value;
-    } else {
-      each<s, true>([&](int i) MPMJAX_INLINE_LAMBDA {
-        add<a + 1>(q, s * row + i, product(block.weights[a][i][q], value));
       });
     }
   }
@@ -140,12 +213,7 @@ struct Scatterer {
   template <bool inside>
   MPMJAX_INLINE void put(const NodeSums<T, s, columns>& nodes, int q) const {
 #pragma GCC unroll 16
-    for (int row = 0; row < rows; ++row) {
-      int32_t first = 0;
-      if constexpr (d == 2) first = block.index[0][row][q];
-      if constexpr (d == 3) first = wrapping_sum(block.index[0][row / s][q], block.index[1][row % s][q]);
-      nodes.template add<inside>(block, q, first, sums[row]);
-    }
+    for (int row = 0; row < rows; ++row) nodes.template add<inside>(block, row, q, sums[row]);
   }
 };
 
@@ -156,17 +224,12 @@ void find_ranges(const Stencils<T>& stencils, int64_t first, int64_t last, Range
     const int count = smaller(stencils.particles - k * kBlock, kBlock);
     Block<T, d, s> block;
     block.find_range(stencils, k * kBlock, count);
-    Range range = {block.least[0], block.most[0]};
-    for (int q = 1; q < count; ++q) {
-      range.least = block.least[q] < range.least ? block.least[q] : range.least;
-      range.most = block.most[q] > range.most ? block.most[q] : range.most;
-    }
-    ranges[k] = range;
+    ranges[k] = {*std::min_element(block.least, block.least + count), *std::max_element(block.most, block.most + count)};
   }
 }
 
-// Adds what all particles give to a range of nodes, in four columns or fewer. `give(block, start, count, rows)` makes it
-// of a block: for each particle the row of its value, and with `graded` then those of its gradients.
+// Adds what all particles give to a range of nodes, in four columns or fewer. `give(block, start, count, rows)` makes
+// it of a block: for each particle the row of its value, and with `graded` then those of its gradients.
 template <class T, int d, int s, bool graded, int columns, class Give>
 MPMJAX_INLINE void add_blocks(const Stencils<T>& stencils, const Range* ranges, const NodeSums<T, s, columns>& nodes,
                               const Give& give) {
@@ -183,20 +246,16 @@ MPMJAX_INLINE void add_blocks(const Stencils<T>& stencils, const Range* ranges, 
     }
     if (some == 0) continue;
     block.find_same_nodes();
-    for (int pass = first_pass(stencils); pass < end_of_passes<d>(stencils); ++pass) {
-      block.evaluate(stencils, start, count, pass);
+    for (int pass = 0; pass < passes<d>(stencils); ++pass) {
+      block.evaluate(stencils, start, count, differentiated(stencils, pass));
       block.join_last();
       Vector<T> rows[graded ? d + 1 : 1][kRoom];
       give(block, start, count, rows);
       for (int k = 0; k < some;) {
-        Scatterer<T, d, s, columns> scatterer{block};
+        Scatterer<T, d, s, graded, columns> scatterer{block};
         const int q = taken[k];
         do {
-          if constexpr (graded) {
-            scatterer.add_graded(taken[k], rows);
-          } else {
-            scatterer.add_value(taken[k], rows);
-          }
+          scatterer.add(taken[k], rows);
         } while (++k < some && block.same_nodes[taken[k]]);
         nodes.holds(block, q) ? scatterer.template put<true>(nodes, q) : scatterer.template put<false>(nodes, q);
       }
@@ -209,8 +268,19 @@ template <class T, int d, int s, bool graded, int columns>
 void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int64_t last) {
   const int64_t particles = task.stencils.particles;
   const NodeSums<T, s, columns> nodes(task.nodes, task.columns, column, first, last);
+  // Of all columns as many as there are of an array, and zeros.
+  const auto read = [&](const T* from, int64_t all, int64_t start, int count, Vector<T>* to) MPMJAX_INLINE_LAMBDA {
+    if (from == nullptr || column >= all) {
+      std::memset(to, 0, kRoom * sizeof *to);
+    } else {
+      read_rows(from + column * particles + start, particles, count, smaller(all - column, nodes.used), to);
+    }
+  };
   const auto give = [&](const auto&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
-    read_values<T, d, graded>(task.values, particles, column, nodes.used, start, count, rows);
+    read(task.values.value, task.columns, start, count, rows[0]);
+    for (int b = 0; b < d && graded; ++b) {
+      read(task.values.gradients + b * task.values.graded * particles, task.values.graded, start, count, rows[b + 1]);
+    }
   };
   add_blocks<T, d, s, graded, columns>(task.stencils, task.ranges, nodes, give);
 }
@@ -233,19 +303,58 @@ void add_all(const Scatter<T>& task, int64_t first, int64_t last) {
 template <class T, int d, int s>
 void scatter(const Scatter<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns;
-  if (task.reached == nullptr) {
-    clear(task.nodes, task.wanted, first * columns, last * columns);
-  } else {
-    mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
-    over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
-      if (reached) {
-        clear(task.nodes, nullptr, from * columns, to * columns);
-      } else {
-        wipe(task.nodes, task.size * columns, from * columns, to * columns);
-      }
-    });
-  }
+  if (task.reached != nullptr) mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
+  over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
+    if (reached) {
+      clear(task.nodes, task.wanted, from * columns, to * columns);
+    } else {
+      wipe(task.nodes, task.size * columns, from * columns, to * columns);
+    }
+  });
   add_all<T, d, s>(task, first, last);
+}
+
+// Of nodes from a first to before a last, all columns, or where `columns` is 0 any number of them.
+template <class T, int columns>
+void divide(const Average<T>& task, int64_t first, int64_t last) {
+  const int64_t c = columns == 0 ? task.columns : columns, others = c - 1;
+  const T least = task.least[0];
+  for (int64_t i = first; i < last; ++i) {
+    const T* sums = task.sums + i * c;
+    const bool some = sums[others] > least;
+    const T whole = some ? sums[others] : T(1);
+    task.whole[i] = some ? whole : T(0);
+    for (int64_t k = 0; k < others; ++k) task.means[i * others + k] = some ? sums[k] / whole : T(0);
+  }
+}
+
+template <class T>
+void divide_all(const Average<T>& task, int64_t first, int64_t last) {
+  switch (task.columns) {
+    case 2: return divide<T, 2>(task, first, last);
+    case 3: return divide<T, 3>(task, first, last);
+    case 4: return divide<T, 4>(task, first, last);
+    default: return divide<T, 0>(task, first, last);
+  }
+}
+
+template <class T, int d, int s>
+void average(const Average<T>& task, int64_t first, int64_t last) {
+  const int64_t columns = task.columns, others = columns - 1;
+  if (task.reached != nullptr) mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
+  over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
+    if (reached) {
+      clear(task.sums, nullptr, from * columns, to * columns);
+    } else {
+      wipe(task.whole, task.size, from, to);
+      wipe(task.means, task.size * others, from * others, to * others);
+    }
+  });
+  const Scatter<T> sums = {task.stencils, task.values, task.sums, task.ranges, nullptr, task.size, columns, nullptr};
+  add_all<T, d, s>(sums, first, last);
+  over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
+    if (reached) divide_all(task, from, to);
+  });
 }
 
 }  // namespace

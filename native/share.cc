@@ -9,8 +9,8 @@
 namespace mpmjax {
 namespace {
 
-// How often a thread looks whether the others are done before it sleeps, which takes some tens of microseconds at most. To
-// be woken may take as long, and shares are of about the same length.
+// How often a thread looks whether the others are done before it sleeps, which takes some tens of microseconds at most.
+// To be woken may take as long, and shares are of about the same length.
 constexpr int kSpins = 1000;
 
 void pause() {

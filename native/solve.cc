@@ -1,12 +1,10 @@
-#include "solve.h"
+// Solves of a batch, on all threads.
 
 #include <cmath>
-#include <cstring>
 #include <limits>
+#include <memory>
 
-#include "active.h"
-#include "vectors.h"
-#include "wipe.h"
+#include "problems.h"
 
 namespace mpmjax {
 namespace {
@@ -17,134 +15,129 @@ class OneThread : public Pool {
   void schedule(std::function<void()> task) const override { task(); }
 };
 
-// The products and norms of a solve. What is not active is never read, but of what the resistance moves.
+// One solve. What is not active is never read, but of what the resistance moves.
 template <class T>
-struct Space {
-  const Pool& pool;
-  const Recurrence<T>& of;
-  const Division& division;
-  int64_t size = of.nodes * of.columns;
+class Solver {
+ public:
+  Solver(const Pool& pool, const Solve<T>& task)
+      : pool_(pool), task_(task), size_(task.nodes * task.columns),
+        allocated_(task.room == 0 ? new T[kVectors * size_] : nullptr),
+        r_(task.room == 0 ? allocated_.get() : task.memory), p_(r_ + size_), q_(p_ + size_),
+        moved_(q_ + size_), image_(moved_ + size_), last_(image_ + size_) {
+    resistance_.stencils = task.stencils, resistance_.matrices = task.matrices, resistance_.moved = moved_;
+    resistance_.nodes = image_, resistance_.wanted = task.active;
+    resistance_.size = task.nodes, resistance_.columns = task.columns;
+    division_ = divided(pool, 1, resistance_);
+    std::fill(moved_, moved_ + size_, T(0));
+    if (task.x != task.start) std::copy(task.start, task.start + size_, task.x);
+  }
 
-  // W⁻¹A x into the image.
-  void apply(Form form) const {
-    over_active(of.active, size, [&](int64_t i) { of.moved[i] = of.free[i] ? of.x[i] : T(0); });
-    resist(pool, form, 1, resistance(of), division);
-    T square;
-    product(pool, 1, Product<T>{of.image, of.x, of.mass, of.factor, of.free, of.weight, of.active, of.image, &square, size,
-                                of.nodes, false});
+  void run() {
+    T* const x = task_.x;
+    const T b = norm(task_.rhs), tolerance = task_.limits[0] * b, most = task_.limits[1];
+    T before = std::numeric_limits<T>::infinity(), change = before;
+    bool stalled = false;
+    while (true) {
+      apply(x);
+      rr_ = square([&](int64_t i) { return task_.rhs[i] - image_[i]; }, [&](int64_t i, T v) { r_[i] = v; });
+      stalled = rr_ > before / 4, before = rr_;
+      if (stalled || vanished_ || !(std::sqrt(rr_) > tolerance) || !(steps_ < most)) break;
+      over_active([&](int64_t i) { last_[i] = x[i]; });
+      recur(tolerance, task_.limits[2] * rr_, most);
+      change = std::sqrt(square([&](int64_t i) { return x[i] - last_[i]; }, [](int64_t, T) {}));
+    }
+    const T result[kOutcome] = {rr_, steps_, radius_, T(vanished_), T(negative_), change, T(stalled), b, norm(x)};
+    std::copy(result, result + kOutcome, task_.numbers);
+  }
+
+ private:
+  // From x with the residual r: p = r + β p, q = W⁻¹A r + β q, x += α p, r −= α q, while ‖r‖ is above the tolerance,
+  // ‖r‖² above the floor, steps are left, and rᵀA r does not vanish to rounding.
+  void recur(T tolerance, T floor, T most) {
+    T *const x = task_.x, *const r = r_, *const p = p_, *const q = q_;
+    over_active([&](int64_t i) { p[i] = q[i] = 0; });
+    const T eps = std::numeric_limits<T>::epsilon();
+    T qq = 0, radius = 0, before = std::numeric_limits<T>::infinity();
+    while (std::sqrt(rr_) > tolerance && rr_ > floor && steps_ < most && !vanished_) {
+      const T gamma = apply(r), beta = gamma / before, onward[] = {beta, beta};
+      const T square = combine_with(r, p, image_, q, onward, p, q);
+      const T rounding = eps * std::sqrt(rr_ * (square + beta * beta * qq));  // of γ: ε‖r‖‖s‖
+      vanished_ = std::abs(gamma) <= rounding;
+      negative_ = negative_ || gamma < -rounding;
+      const T alpha = vanished_ ? T(0) : gamma / square, along[] = {alpha, -alpha};
+      const T quotient = std::abs(gamma) / rr_;
+      if (!(quotient <= radius)) radius = quotient;
+      rr_ = combine_with(x, p, r, q, along, x, r);
+      before = gamma, qq = square, ++steps_;
+    }
+    radius_ = std::max(radius_, radius);
+  }
+
+  // W⁻¹A v into the image; returns vᵀA v.
+  T apply(const T* v) {
+    over_active([&](int64_t i) { moved_[i] = task_.free[i] ? v[i] : T(0); });
+    resist(pool_, 1, resistance_, division_);
+    T result;
+    product(pool_, 1, Product<T>{image_, v, task_.mass, task_.factor, task_.free, task_.weight, task_.active, image_,
+                                 &result, size_, task_.nodes, false});
+    return result;
+  }
+
+  T combine_with(const T* a, const T* b, const T* c, const T* d, const T* scales, T* y, T* z) {
+    T result;
+    combine(pool_, 1, Combine<T>{a, b, c, d, scales, task_.weight, task_.active, y, z, &result, size_});
+    return result;
+  }
+
+  // Calls run(i) for all numbers of the active blocks.
+  template <class Run>
+  void over_active(const Run& run) const {
+    for (int64_t first = 0, k = 0; first < size_; first += kChunk, ++k) {
+      if (!task_.active[k]) continue;
+      const int64_t last = std::min(size_, first + kChunk);
+      for (int64_t i = first; i < last; ++i) run(i);
+    }
   }
 
   // ‖v‖² with v_i = value(i), each handed to put(i, v_i). The sum is that of products in double.
   template <class Value, class Put>
   T square(const Value& value, const Put& put) const {
     double sum = 0;
-    over_active(of.active, size, [&](int64_t i) {
+    over_active([&](int64_t i) {
       const T v = value(i);
       put(i, v);
-      sum += static_cast<double>(of.weight[i] * v) * v;
+      sum += static_cast<double>(task_.weight[i] * v) * v;
     });
     return static_cast<T>(sum);
   }
 
-  // ‖v‖.
   T norm(const T* v) const {
     return std::sqrt(square([&](int64_t i) { return v[i]; }, [](int64_t, T) {}));
   }
+
+  const Pool& pool_;
+  const Solve<T>& task_;
+  const int64_t size_;
+  const std::unique_ptr<T[]> allocated_;
+  T *const r_, *const p_, *const q_, *const moved_, *const image_, *const last_;
+  Resist<T> resistance_ = {};
+  Division division_;
+  T rr_ = 0, steps_ = 0, radius_ = 0;
+  bool vanished_ = false, negative_ = false;
 };
-
-// The recurrence. The division is that of the resistance.
-template <class T>
-void recur(const Pool& pool, Form form, const Recurrence<T>& task, const Division& division) {
-  const int64_t size = task.nodes * task.columns;
-  T *const r = task.r, *const p = task.p, *const q = task.q, *const moved = task.moved, *const image = task.image;
-  over_active(task.active, size, [&](int64_t i) { p[i] = q[i] = 0; });
-  const T eps = std::numeric_limits<T>::epsilon();
-  T rr = task.limits[3], qq = 0, before = std::numeric_limits<T>::infinity(), radius = 0;
-  int64_t steps = 0;
-  bool vanished = false, negative = false;
-  while (std::sqrt(rr) > task.limits[0] && rr > task.limits[1] && T(steps) < task.limits[2] && !vanished) {
-    over_active(task.active, size, [&](int64_t i) { moved[i] = task.free[i] ? r[i] : T(0); });
-    resist(pool, form, 1, resistance(task), division);
-    T gamma, square;
-    product(pool, 1, Product<T>{image, r, task.mass, task.factor, task.free, task.weight, task.active, image, &gamma, size,
-                                task.nodes, false});
-    const T beta = gamma / before, onward[] = {beta, beta};
-    combine(pool, 1, Combine<T>{r, p, image, q, onward, task.weight, task.active, p, q, &square, size});
-    const T rounding = eps * std::sqrt(rr * (square + beta * beta * qq));  // of γ: ε‖r‖‖s‖
-    vanished = std::abs(gamma) <= rounding;
-    negative = negative || gamma < -rounding;
-    const T alpha = vanished ? T(0) : gamma / square, along[] = {alpha, -alpha};
-    const T quotient = std::abs(gamma) / rr;
-    if (!(quotient <= radius)) radius = quotient;
-    combine(pool, 1, Combine<T>{task.x, p, r, q, along, task.weight, task.active, task.x, r, &rr, size});
-    before = gamma, qq = square, ++steps;
-  }
-  const T numbers[kNumbers] = {rr, T(steps), radius, T(vanished), T(negative)};
-  std::copy(numbers, numbers + kNumbers, task.numbers);
-}
-
-template <class T>
-void run(const Pool& pool, Form form, const Solve<T>& task) {
-  Recurrence<T> pass = task.recurrence;
-  const Division division = divided(pool, form, 1, resistance(pass));
-  const Space<T> space{pool, pass, division};
-  const int64_t size = space.size;
-  const std::unique_ptr<T[]> allocated(task.memory == nullptr ? new T[kVectors * size] : nullptr);
-  T* const memory = task.memory == nullptr ? allocated.get() : task.memory;
-  T *const x = pass.x, *const r = memory, *const last = r + size;
-  pass.r = r, pass.p = last + size, pass.q = pass.p + size, pass.moved = pass.q + size, pass.image = pass.moved + size;
-  wipe(pass.moved, size, 0, size);
-  if (x != task.start) std::memcpy(x, task.start, static_cast<size_t>(size) * sizeof(T));
-  const T b = space.norm(task.rhs), most = task.limits[1];
-  T limits[kLimits] = {task.limits[0] * b, 0, 0, 0}, numbers[kNumbers] = {};
-  T rr, before = std::numeric_limits<T>::infinity(), change = before, steps = 0, radius = 0;
-  bool vanished = false, negative = false, stalled = false;
-  pass.limits = limits, pass.numbers = numbers;
-  while (true) {
-    space.apply(form);
-    rr = space.square([&](int64_t i) { return task.rhs[i] - pass.image[i]; }, [&](int64_t i, T v) { r[i] = v; });
-    stalled = rr > before / 4, before = rr;
-    if (stalled || vanished || !(std::sqrt(rr) > limits[0]) || !(steps < most)) break;
-    limits[1] = task.limits[2] * rr, limits[2] = most - steps, limits[3] = rr;
-    over_active(pass.active, size, [&](int64_t i) { last[i] = x[i]; });
-    recur(pool, form, pass, division);
-    change = std::sqrt(space.square([&](int64_t i) { return x[i] - last[i]; }, [](int64_t, T) {}));
-    steps += numbers[1], radius = std::max(radius, numbers[2]);
-    vanished = numbers[3] != 0, negative = negative || numbers[4] != 0;
-  }
-  const T result[kOutcome] = {rr, steps, radius, T(vanished), T(negative), change, T(stalled), b, space.norm(x)};
-  std::copy(result, result + kOutcome, task.numbers);
-}
-
-template <class T>
-Solve<T> member(Solve<T> all, Form form, int64_t i) {
-  Recurrence<T>& of = all.recurrence;
-  const int64_t particles = of.stencils.particles;
-  const int64_t size = of.nodes * of.columns, vectors = i * size;
-  of.stencils = member(of.stencils, form, i);
-  of.matrices += i * form.d * form.d * (form.d * form.d + 1) / 2 * particles;
-  of.mass += i * of.nodes;
-  of.factor += i;
-  of.free += vectors, of.weight += vectors, of.x += vectors, all.start += vectors, all.rhs += vectors;
-  of.active += i * ((size + kChunk - 1) / kChunk);
-  all.limits += i * kTolerances;
-  all.numbers += i * kOutcome;
-  if (all.memory != nullptr) all.memory += i * kVectors * size;
-  return all;
-}
 
 }  // namespace
 
 template <class T>
-void solve(const Pool& pool, Form form, int64_t batch, const Solve<T>& all) {
+void solve(const Pool& pool, int64_t batch, const Solve<T>& all) {
   if (batch >= pool.threads()) {
-    share(pool, batch, [&](int64_t i) { run(OneThread(), form, member(all, form, i)); });
+    share(pool, batch, [&](int64_t i) { Solver<T>(OneThread(), member(all, i)).run(); });
   } else {
-    for (int64_t i = 0; i < batch; ++i) run(pool, form, member(all, form, i));
+    for (int64_t i = 0; i < batch; ++i) Solver<T>(pool, member(all, i)).run();
   }
 }
 
-template void solve(const Pool&, Form, int64_t, const Solve<float>&);
-template void solve(const Pool&, Form, int64_t, const Solve<double>&);
+template void solve(const Pool&, int64_t, const Solve<float>&);
+template void solve(const Pool&, int64_t, const Solve<double>&);
 
 }  // namespace mpmjax

@@ -1,11 +1,10 @@
-#include "sums.h"
+// The sums for a batch, on all threads.
 
 #include <algorithm>
 #include <memory>
 #include <vector>
 
-#include "active.h"
-#include "instructions.h"
+#include "problems.h"
 
 namespace mpmjax {
 namespace {
@@ -20,115 +19,35 @@ constexpr int64_t kSamples = 512;
 constexpr double kMostReached = 1.5;
 constexpr int64_t kRound = 64;  // particles of a share are a multiple of this: no two write to one line of a cache
 
-int64_t power(int64_t base, int exponent) { return exponent == 0 ? 1 : base * power(base, exponent - 1); }
-
 // How many shares each problem of a batch is cut into, for so many a thread.
-int64_t shares(const Pool& pool, Form form, int64_t batch, int64_t particles, int64_t columns, int64_t each) {
-  const int64_t visits = particles * power(form.s, form.d) * ((columns + 3) / 4);
+template <class Problem>
+int64_t shares(const Pool& pool, int64_t batch, const Problem& all, int64_t each) {
+  int64_t visits = all.stencils.particles;
+  for (int a = 0; a < all.stencils.basis.d; ++a) visits *= all.stencils.basis.s;
   const int64_t most = pool.threads() > 1 ? (each * pool.threads() + batch - 1) / batch : 1;
-  return std::max<int64_t>(1, std::min(visits / kLeastVisits, most));
-}
-
-int64_t blocks_of(int64_t numbers) { return (numbers + kChunk - 1) / kChunk; }
-
-// The blocks of nodes that are wanted of the i-th member.
-const bool* member(const bool* wanted, int64_t i, int64_t numbers) {
-  return wanted == nullptr ? nullptr : wanted + i * blocks_of(numbers);
-}
-
-template <class T>
-ParticleValues<T> member(ParticleValues<T> all, Form form, int64_t i, int64_t columns, int64_t particles) {
-  if (all.value != nullptr) all.value += i * columns * particles;
-  if (all.gradients != nullptr) all.gradients += i * form.d * all.graded * particles;
-  return all;
-}
-
-template <class T>
-Gather<T> member(Gather<T> all, Form form, int64_t i) {
-  all.stencils = member(all.stencils, form, i);
-  all.nodes += i * all.size * all.columns;
-  all.value += i * all.columns * all.stencils.particles;
-  all.gradients += i * form.d * all.columns * all.stencils.particles;
-  return all;
-}
-
-template <class T>
-Scatter<T> member(Scatter<T> all, Form form, int64_t i) {
-  all.stencils = member(all.stencils, form, i);
-  all.nodes += i * all.size * all.columns;
-  all.values = member(all.values, form, i, all.columns, all.stencils.particles);
-  all.wanted = member(all.wanted, i, all.size * all.columns);
-  if (all.reached != nullptr) all.reached += i * blocks_of(all.size);
-  return all;
-}
-
-template <class T>
-Average<T> member(Average<T> all, Form form, int64_t i) {
-  all.stencils = member(all.stencils, form, i);
-  all.values = member(all.values, form, i, all.columns, all.stencils.particles);
-  all.least += i;
-  all.whole += i * all.size;
-  all.means += i * all.size * (all.columns - 1);
-  all.sums += i * all.size * all.columns;
-  if (all.reached != nullptr) all.reached += i * blocks_of(all.size);
-  return all;
-}
-
-template <class T>
-Pull<T> member(Pull<T> all, Form form, int64_t i) {
-  all.stencils = member(all.stencils, form, i);
-  all.nodes += i * all.size * all.columns;
-  all.by_offset += i * form.d * all.stencils.particles;
-  if (all.value != nullptr) {
-    all.value += i * all.columns * all.stencils.particles;
-    all.gradients += i * form.d * all.columns * all.stencils.particles;
-  }
-  all.values = member(all.values, form, i, all.columns, all.stencils.particles);
-  return all;
-}
-
-template <class T>
-Resist<T> member(Resist<T> all, Form form, int64_t i) {
-  all.stencils = member(all.stencils, form, i);
-  all.matrices += i * form.d * form.d * (form.d * form.d + 1) / 2 * all.stencils.particles;
-  all.moved += i * all.size * all.columns;
-  all.nodes += i * all.size * all.columns;
-  if (all.gradients != nullptr) all.gradients += i * form.d * all.columns * all.stencils.particles;
-  all.wanted = member(all.wanted, i, all.size * all.columns);
-  return all;
+  return std::max<int64_t>(1, std::min(visits * ((all.columns + 3) / 4) / kLeastVisits, most));
 }
 
 // Calls run(problem, first, last) for all particles of all members.
 template <class Problem, class Run>
-void over_particles(const Pool& pool, Form form, int64_t batch, const Problem& all, const Run& run) {
-  const int64_t particles = all.stencils.particles;
-  const int64_t parts = shares(pool, form, batch, particles, all.columns, kShares);
-  const int64_t each = ((particles + parts - 1) / parts + kRound - 1) / kRound * kRound;
-  share(pool, batch * parts, [&](int64_t i) {
-    const int64_t first = i % parts * each, last = std::min(particles, first + each);
-    if (first < last) run(member(all, form, i / parts), first, last);
-  });
-}
-
-// The flat index of a node in the middle of a particle's stencil.
-template <class T>
-int64_t middle_node(const Stencils<T>& stencils, Form form, int64_t particle) {
-  int64_t node = 0;
-  for (int a = 0; a < form.d; ++a) {
-    const int64_t first = stencils.first[a * stencils.particles + particle];
-    node += (first + form.s / 2) * stencils.basis.strides[a];
-  }
-  return node;
+void over_particles(const Pool& pool, int64_t batch, const Problem& all, const Run& run) {
+  const int64_t particles = all.stencils.particles, each = blocks_of(particles, shares(pool, batch, all, kShares));
+  share_parts(pool, batch, particles, std::max<int64_t>(1, blocks_of(each, kRound)) * kRound,
+              [&](int64_t m, int64_t first, int64_t last) { run(member(all, m), first, last); });
 }
 
 // Where the nodes are cut into parts with about as many particles each, by a sample: the k-th part goes from the k-th
 // number to the next. None cuts a block of kChunk nodes. How well they are chosen changes seconds, never sums.
 template <class T>
-std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, Form form, int64_t parts) {
+std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, int64_t parts) {
   const int64_t particles = stencils.particles, samples = std::min(kSamples, particles);
   std::vector<int64_t> places;
   for (int64_t k = 0; parts > 1 && k < samples; ++k) {
-    const int64_t middle = middle_node(stencils, form, k * particles / samples);
+    int64_t middle = 0;  // the flat index of a node in the middle of a particle's stencil
+    for (int a = 0; a < stencils.basis.d; ++a) {
+      const int64_t first = stencils.first[a * particles + k * particles / samples];
+      middle += (first + stencils.basis.s / 2) * stencils.basis.strides[a];
+    }
     if (middle >= 0 && middle < size) places.push_back(middle);
   }
   std::sort(places.begin(), places.end());
@@ -143,11 +62,11 @@ std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, Form form, i
 
 // Calls run(problem, first, last) for the nodes of all members.
 template <class Problem, class Run>
-void over_nodes(const Pool& pool, Form form, int64_t batch, const Problem& all, const Division& by, const Run& run) {
+void over_nodes(const Pool& pool, int64_t batch, const Problem& all, const Division& by, const Run& run) {
   share(pool, batch * by.parts, [&](int64_t i) {
     const std::vector<int64_t>& cuts = by.cuts[i / by.parts];
     const int64_t first = cuts[i % by.parts], last = cuts[i % by.parts + 1];
-    Problem task = member(all, form, i / by.parts);
+    Problem task = member(all, i / by.parts);
     task.ranges = by.ranges.empty() ? nullptr : by.ranges.data() + i / by.parts * by.blocks;
     if (first < last) run(task, first, last);
   });
@@ -166,86 +85,84 @@ double reached(const Division& by) {
 }
 
 template <class T, class Problem>
-Division divide(const Pool& pool, Form form, int64_t batch, const Problem& all, const Kernels<T>& kernels,
-                bool wanted = false) {
-  const int64_t particles = all.stencils.particles, blocks = (particles + kBlock - 1) / kBlock;
-  Division result = {shares(pool, form, batch, particles, all.columns, 1), blocks, {}, {}};
-  const int64_t parts = result.parts, each = (blocks + parts - 1) / parts;
+Division divide(const Pool& pool, int64_t batch, const Problem& all, const Kernels<T>& kernels, bool wanted = false) {
+  const int64_t blocks = blocks_of(all.stencils.particles, kBlock), parts = shares(pool, batch, all, 1);
+  Division result = {parts, blocks, {}, {}};
   result.cuts.assign(batch, {0, all.size});
   if (parts == 1 && !wanted) return result;
   result.ranges.resize(batch * blocks);
-  share(pool, batch * parts, [&](int64_t i) {
-    const int64_t k = i / parts, first = i % parts * each, last = std::min(blocks, first + each);
-    const Stencils<T> stencils = member(all.stencils, form, k);
-    if (first < last) kernels.find_ranges(stencils, first, last, result.ranges.data() + k * blocks);
-    if (first == 0) result.cuts[k] = cut(stencils, all.size, form, parts);
+  share_parts(pool, batch, blocks, std::max<int64_t>(1, blocks_of(blocks, parts)),
+              [&](int64_t m, int64_t first, int64_t last) {
+    const Problem one = member(all, m);
+    kernels.find_ranges(one.stencils, first, last, result.ranges.data() + m * blocks);
+    if (first == 0) result.cuts[m] = cut(one.stencils, all.size, parts);
   });
   return result;
 }
 
-// Sets all nodes of a scatter or an average. Where they are too many for a cache, those that no particle reaches are told.
+// Sets all nodes of a scatter or an average. Where they are too many for a cache, those that no particle reaches are
+// told.
 template <class T, class Problem>
-void set_nodes(const Pool& pool, Form form, int64_t batch, Problem all, const Kernels<T>& kernels,
+void set_nodes(const Pool& pool, int64_t batch, Problem all, const Kernels<T>& kernels,
                void (*run)(const Problem&, int64_t, int64_t)) {
   const bool large = all.size * all.columns * static_cast<int64_t>(sizeof(T)) > kCached;
-  const Vectors<bool> reached = large ? zeros<bool>(batch * blocks_of(all.size)) : nullptr;
+  const std::unique_ptr<bool[]> reached(large ? new bool[batch * blocks_of(all.size)]() : nullptr);
   all.reached = reached.get();
-  over_nodes(pool, form, batch, all, divide(pool, form, batch, all, kernels, large), run);
+  over_nodes(pool, batch, all, divide(pool, batch, all, kernels, large), run);
 }
 
-template <class T>
-const Kernels<T>& kernels_of(Form form) {
-  return *kernels<T>().sums(form.d, form.s);
+template <class T, template <class> class Problem>
+const Kernels<T>& kernels_of(const Problem<T>& all) {
+  return *kernels<T>().sums(all.stencils.basis.d, all.stencils.basis.s);
 }
 
 }  // namespace
 
 template <class T>
-void gather(const Pool& pool, Form form, int64_t batch, const Gather<T>& all) {
-  over_particles(pool, form, batch, all, kernels_of<T>(form).gather);
+void gather(const Pool& pool, int64_t batch, const Gather<T>& all) {
+  over_particles(pool, batch, all, kernels_of(all).gather);
 }
 
 template <class T>
-void pull(const Pool& pool, Form form, int64_t batch, const Pull<T>& all) {
-  over_particles(pool, form, batch, all, kernels_of<T>(form).pull);
+void pull(const Pool& pool, int64_t batch, const Pull<T>& all) {
+  over_particles(pool, batch, all, kernels_of(all).pull);
 }
 
 template <class T>
-void scatter(const Pool& pool, Form form, int64_t batch, const Scatter<T>& all) {
-  set_nodes(pool, form, batch, all, kernels_of<T>(form), kernels_of<T>(form).scatter);
+void scatter(const Pool& pool, int64_t batch, const Scatter<T>& all) {
+  set_nodes(pool, batch, all, kernels_of(all), kernels_of(all).scatter);
 }
 
 template <class T>
-void average(const Pool& pool, Form form, int64_t batch, const Average<T>& all) {
-  set_nodes(pool, form, batch, all, kernels_of<T>(form), kernels_of<T>(form).average);
+void average(const Pool& pool, int64_t batch, const Average<T>& all) {
+  set_nodes(pool, batch, all, kernels_of(all), kernels_of(all).average);
 }
 
 template <class T>
-Division divided(const Pool& pool, Form form, int64_t batch, const Resist<T>& all) {
-  return divide(pool, form, batch, all, kernels_of<T>(form));
+Division divided(const Pool& pool, int64_t batch, const Resist<T>& all) {
+  return divide(pool, batch, all, kernels_of(all));
 }
 
 template <class T>
-void resist(const Pool& pool, Form form, int64_t batch, const Resist<T>& all, const Division& division) {
-  const Kernels<T>& kernels = kernels_of<T>(form);
-  if (reached(division) <= kMostReached) return over_nodes(pool, form, batch, all, division, kernels.resist);
+void resist(const Pool& pool, int64_t batch, const Resist<T>& all, const Division& division) {
+  if (reached(division) <= kMostReached) return over_nodes(pool, batch, all, division, kernels_of(all).resist);
   // Each particle once, and then a scatter: the parts would do most particles several times.
-  const std::unique_ptr<T[]> stored(new T[batch * form.d * all.columns * all.stencils.particles]);
+  const std::unique_ptr<T[]> stored(new T[batch * all.columns * all.columns * all.stencils.particles]);
   Resist<T> first = all;
   first.gradients = stored.get();
   const ParticleValues<T> values = {nullptr, stored.get(), all.columns};
   const Scatter<T> rest = {all.stencils, values, all.nodes, nullptr, nullptr, all.size, all.columns, all.wanted};
-  over_particles(pool, form, batch, first, kernels.resist_particles);
-  over_nodes(pool, form, batch, rest, division, kernels.scatter);
+  over_particles(pool, batch, first, kernels_of(all).resist_particles);
+  over_nodes(pool, batch, rest, division, kernels_of(all).scatter);
 }
 
 #define MPMJAX_SUMS(T)                                                        \
-  template void gather(const Pool&, Form, int64_t, const Gather<T>&);         \
-  template void scatter(const Pool&, Form, int64_t, const Scatter<T>&);       \
-  template void average(const Pool&, Form, int64_t, const Average<T>&);       \
-  template void pull(const Pool&, Form, int64_t, const Pull<T>&);             \
-  template Division divided(const Pool&, Form, int64_t, const Resist<T>&);    \
-  template void resist(const Pool&, Form, int64_t, const Resist<T>&, const Division&);
+  template void gather(const Pool&, int64_t, const Gather<T>&);         \
+  template void scatter(const Pool&, int64_t, const Scatter<T>&);       \
+  template void average(const Pool&, int64_t, const Average<T>&);       \
+  template void pull(const Pool&, int64_t, const Pull<T>&);             \
+  template Division divided(const Pool&, int64_t, const Resist<T>&);    \
+  template void resist(const Pool&, int64_t, const Resist<T>&, const Division&);
 MPMJAX_SUMS(float)
 MPMJAX_SUMS(double)
 

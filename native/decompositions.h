@@ -1,15 +1,98 @@
-// The rotation of the polar decomposition of 3 x 3 matrices, as mpmjax/linalg/_rotation.py writes it (N. J. Higham, V.
-// Noferini, Numer. Algorithms 73 (2016) 349, doi 10.1007/s11075-016-0098-7).
+// Decompositions of 3 x 3 matrices, a particle in each lane: the eigenvalues and eigenvectors of symmetric ones, by
+// Jacobi's cyclic method (G. H. Golub, C. F. Van Loan, Matrix Computations, 4th ed., 2013, section 8.5), and the
+// rotation of the polar decomposition, as mpmjax/linalg/_rotation.py writes it (N. J. Higham, V. Noferini, Numer.
+// Algorithms 73 (2016) 349, doi 10.1007/s11075-016-0098-7).
 
 #pragma once
 
-#include "simd.h"
-#include "matrices.h"
+#include <limits>
+
+#include "problems.h"
+#include "vector.h"
 
 namespace {
 
+constexpr int kSweeps = 4;        // of Jacobi's method, the error squares in each
 constexpr int kNewtonSteps = 30;  // on the quartic: halves the error at a double root, else squares it
 constexpr int kPolishSteps = 2;   // on the rotation itself
+
+template <class V>
+MPMJAX_INLINE V magnitude(V x) {
+  return x < 0 ? -x : x;
+}
+
+template <class V>
+MPMJAX_INLINE V root(V x) {
+#if defined(__clang__)
+  return __builtin_elementwise_sqrt(x);
+#else
+  V y = {};
+#pragma GCC unroll 16
+  for (size_t i = 0; i < sizeof x / sizeof x[0]; ++i) y[i] = std::sqrt(x[i]);
+  return y;
+#endif
+}
+
+template <class V>
+struct Matrix {
+  V at[3][3];
+};
+
+// Calls f(i, j) for all components.
+template <class F>
+MPMJAX_INLINE void components(const F& f) {
+  each<3>([&](auto i) MPMJAX_INLINE_LAMBDA { each<3>([&](auto j) MPMJAX_INLINE_LAMBDA { f(i, j); }); });
+}
+
+// One rotation of the method: component (p, q) of A becomes zero, and A = V A' Vᵀ stays the same matrix. Only the upper
+// triangle is kept. Nothing is done where the component is negligible.
+template <int p, int q, class V>
+MPMJAX_INLINE void rotate(Matrix<V>& A, Matrix<V>& vectors, V negligible) {
+  constexpr int r = 3 - p - q;
+  const V one = V() + 1, gap = A.at[q][q] - A.at[p][p], twice = 2 * A.at[p][q];
+  const V scale = magnitude(gap) + root(gap * gap + twice * twice);
+  const V tan = magnitude(A.at[p][q]) <= negligible ? V() : (gap < 0 ? -twice : twice) / (scale == 0 ? one : scale);
+  const V cos = one / root(one + tan * tan), sin = tan * cos;
+  const auto turn = [&](V& a, V& b) MPMJAX_INLINE_LAMBDA {
+    const V old = a;
+    a = cos * old - sin * b;
+    b = sin * old + cos * b;
+  };
+  A.at[p][p] -= tan * A.at[p][q];
+  A.at[q][q] += tan * A.at[p][q];
+  A.at[p][q] = V();
+  turn(r < p ? A.at[r][p] : A.at[p][r], r < q ? A.at[r][q] : A.at[q][r]);
+  each<3>([&](auto i) MPMJAX_INLINE_LAMBDA { turn(vectors.at[i][p], vectors.at[i][q]); });
+}
+
+template <class T>
+void eigen(const mpmjax::Eigen<T>& task, int64_t first, int64_t last) {
+  using V = Simd<T>;
+  const V one = V() + 1, negligible = V() + std::numeric_limits<T>::epsilon() / 8;
+  for (int64_t k = first; k < last; k += kSimdLanes<T>) {
+    const ParticleLanes<T> lanes(k, last, task.particles);
+    Matrix<V> A, vectors;
+    V size = {};  // the largest magnitude, of which squares could overflow
+    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA {
+      A.at[i][j] = i <= j ? lanes.load(task.matrices, 3 * i + j) : V();
+      size = magnitude(A.at[i][j]) > size ? magnitude(A.at[i][j]) : size;
+    });
+    size = size == 0 ? one : size;
+    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA {
+      A.at[i][j] /= size;
+      vectors.at[i][j] = i == j ? one : V();
+    });
+    for (int sweep = 0; sweep < kSweeps; ++sweep) {
+      const auto rest = [&](const V& a) MPMJAX_INLINE_LAMBDA { return ~(magnitude(a) <= negligible); };
+      if (!any(rest(A.at[0][1]) | rest(A.at[0][2]) | rest(A.at[1][2]))) break;
+      rotate<0, 1>(A, vectors, negligible);
+      rotate<0, 2>(A, vectors, negligible);
+      rotate<1, 2>(A, vectors, negligible);
+    }
+    each<3>([&](auto i) MPMJAX_INLINE_LAMBDA { lanes.store(task.values, i, A.at[i][i] * size); });
+    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { lanes.store(task.vectors, 3 * i + j, vectors.at[i][j]); });
+  }
+}
 
 template <class V>
 struct Quaternion {
@@ -58,7 +141,7 @@ MPMJAX_INLINE void normalise(Quaternion<V>& q) {
   const V size = root(q.at[0] * q.at[0] + q.at[1] * q.at[1] + q.at[2] * q.at[2] + q.at[3] * q.at[3]);
   const auto nothing = size == 0;
   const V scale = nothing ? one : size;
-  each<4, true>([&](auto i) MPMJAX_INLINE_LAMBDA { q.at[i] /= scale; });
+  each<4>([&](auto i) MPMJAX_INLINE_LAMBDA { q.at[i] /= scale; });
   q.at[0] = nothing ? one : q.at[0];
 }
 
@@ -77,14 +160,14 @@ MPMJAX_INLINE Quaternion<V> dominant_quaternion(const Matrix<V>& F, V largest) {
   const V z[3] = {F.at[2][1] - F.at[1][2], F.at[0][2] - F.at[2][0], F.at[1][0] - F.at[0][1]};
   V K[4][4];
   K[0][0] = trace - largest;
-  each<3, true>([&](auto i) MPMJAX_INLINE_LAMBDA { K[0][i + 1] = K[i + 1][0] = z[i]; });
+  each<3>([&](auto i) MPMJAX_INLINE_LAMBDA { K[0][i + 1] = K[i + 1][0] = z[i]; });
   components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA {
     const V sum = F.at[i][j] + F.at[j][i];
     K[i + 1][j + 1] = i == j ? sum - trace - largest : sum;
   });
   V adjoint[4][4];
-  each<4, true>([&](auto i) MPMJAX_INLINE_LAMBDA {
-    each<4, true>([&](auto j) MPMJAX_INLINE_LAMBDA {
+  each<4>([&](auto i) MPMJAX_INLINE_LAMBDA {
+    each<4>([&](auto j) MPMJAX_INLINE_LAMBDA {
       if constexpr (j >= i) {
         const V minor = signed_minor<i, j>(K);
         adjoint[i][j] = minor;
@@ -94,10 +177,10 @@ MPMJAX_INLINE Quaternion<V> dominant_quaternion(const Matrix<V>& F, V largest) {
   });
   Quaternion<V> q = {{adjoint[0][0], adjoint[0][1], adjoint[0][2], adjoint[0][3]}};
   V size = magnitude(adjoint[0][0]);
-  each<3, true>([&](auto other) MPMJAX_INLINE_LAMBDA {
+  each<3>([&](auto other) MPMJAX_INLINE_LAMBDA {
     constexpr int j = other + 1;
     const auto larger = magnitude(adjoint[j][j]) > size;
-    each<4, true>([&](auto i) MPMJAX_INLINE_LAMBDA { q.at[i] = larger ? adjoint[j][i] : q.at[i]; });
+    each<4>([&](auto i) MPMJAX_INLINE_LAMBDA { q.at[i] = larger ? adjoint[j][i] : q.at[i]; });
     size = larger ? magnitude(adjoint[j][j]) : size;
   });
   normalise(q);
@@ -125,13 +208,13 @@ MPMJAX_INLINE void polish(Quaternion<V>& q, const Matrix<V>& F) {
   const V v[3] = {S.at[2][1] - S.at[1][2], S.at[0][2] - S.at[2][0], S.at[1][0] - S.at[0][1]};
   const V det = determinant(system);
   V spin[3];
-  each<3, true>([&](auto i) MPMJAX_INLINE_LAMBDA {
+  each<3>([&](auto i) MPMJAX_INLINE_LAMBDA {
     spin[i] = (cofactor(system, 0, i) * v[0] + cofactor(system, 1, i) * v[1] + cofactor(system, 2, i) * v[2]) / det;
   });
   const V w = q.at[0], x = q.at[1], y = q.at[2], z = q.at[3], a = spin[0], b = spin[1], c = spin[2];
   const V turned[4] = {-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a};
-  const auto near = a * a + b * b + c * c < V() + static_cast<decltype(a[0] + 0)>(0.1);  // not where R is hardly determined
-  each<4, true>([&](auto i) MPMJAX_INLINE_LAMBDA { q.at[i] = near ? q.at[i] + turned[i] / 2 : q.at[i]; });
+  const auto near = a * a + b * b + c * c < V() + static_cast<decltype(a[0] + 0)>(0.1);  // else R is hardly known
+  each<4>([&](auto i) MPMJAX_INLINE_LAMBDA { q.at[i] = near ? q.at[i] + turned[i] / 2 : q.at[i]; });
   normalise(q);
 }
 
@@ -139,16 +222,16 @@ template <class T>
 void rotation(const mpmjax::Rotation<T>& task, int64_t first, int64_t last) {
   using V = Simd<T>;
   for (int64_t k = first; k < last; k += kSimdLanes<T>) {
-    const Place<T> place(k, last, task.particles);
+    const ParticleLanes<T> lanes(k, last, task.particles);
     Matrix<V> F;
-    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { F.at[i][j] = place.load(task.matrices, 3 * i + j); });
+    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { F.at[i][j] = lanes.load(task.matrices, 3 * i + j); });
     const V norm = root(total<V>([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { return F.at[i][j] * F.at[i][j]; }));
     const V size = norm == 0 ? V() + 1 : norm;
     components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { F.at[i][j] /= size; });
     Quaternion<V> q = dominant_quaternion(F, largest_root(F));
     for (int step = 0; step < kPolishSteps; ++step) polish(q, F);
     const Matrix<V> R = rotation_of(q);
-    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { place.store(task.rotations, 3 * i + j, R.at[i][j]); });
+    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { lanes.store(task.rotations, 3 * i + j, R.at[i][j]); });
   }
 }
 
