@@ -122,48 +122,44 @@ class IsotropicDifferential(AbstractDifferential):
         return jax.jvp(self.law.stress, (self.F,), (dF,))[1]
 
     def pushed_forward(self, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"]:
-        return isotropic_matrix(self.law, self.F, A, weight)
+        """By the law's `principal_differential`. With F = U diag(s) Vᵀ and R = A V, and of the eigenstructure the
+        scaling S_ij and for each pair h and g, half the sum of flip and twist and half their difference, the matrix is
 
+            K_(ba)(dc) = w (Σ_ij S_ij U_ai R_bi U_cj R_dj + Σ_i≠j U_ai R_bj (h_ij U_ci R_dj + g_ij U_cj R_di)).
+        """
+        d, (U, s, V) = len(A), la.principal_frame(self.F)
+        at = jax.tree.map(lambda part: weight * part, self.law.principal_differential(s))
+        # barriers: factors, products of two components, are computed before the sums, and no component repeats them
+        U, V, at = jax.lax.optimization_barrier((U, V, at))
+        R, none = la.matmul(A, V), jnp.zeros_like(s[0])
+        mixed = jnp.stack([R[:, None, i] * U[None, :, i] for i in range(d)])  # R_bi U_ai
+        left, right = (jnp.stack([B[:, None, i] * B[None, :, i] for i in range(d)]) for B in (U, R))
 
-def isotropic_matrix(law: Any, F: Matrix, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"]:
-    """`AbstractDifferential.pushed_forward` by the law's `principal_differential`.
+        def over_pairs(entry: Array) -> Matrix:
+            """The symmetric matrix of a number for each pair."""
+            place = {pair: entry[k] for k, pair in enumerate(la.pairs(d))}
+            return la.assemble([[place.get((min(i, j), max(i, j)), none) for j in range(d)] for i in range(d)])
 
-    With F = U diag(s) Vᵀ and R = A V, and of the eigenstructure the scaling S_ij and for each pair h and g, half the
-    sum of flip and twist and half their difference, the matrix is
+        def summed(coefficients: Matrix, terms: Float[Array, "d a b *p"]) -> Float[Array, "d a b *p"]:
+            """Σ_j c_ij M_j."""
+            return (coefficients[:, :, None, None] * terms).sum(axis=1)
 
-        K_(ba)(dc) = w (Σ_ij S_ij U_ai R_bi U_cj R_dj + Σ_i≠j U_ai R_bj (h_ij U_ci R_dj + g_ij U_cj R_di)).
-    """
-    d, (U, s, V) = len(F), la.principal_frame(F)
-    at = jax.tree.map(lambda part: weight * part, law.principal_differential(s))
-    # barriers: factors, products of two components, are computed before the sums, and no component repeats them
-    U, V, at = jax.lax.optimization_barrier((U, V, at))
-    R, none = la.matmul(A, V), jnp.zeros_like(s[0])
-    mixed = jnp.stack([R[:, None, i] * U[None, :, i] for i in range(d)])  # R_bi U_ai
-    left, right = (jnp.stack([B[:, None, i] * B[None, :, i] for i in range(d)]) for B in (U, R))
+        scaled = summed(at.scaling, mixed)
+        straight = summed(over_pairs((at.flip + at.twist) / 2), right)
+        crossed = summed(over_pairs((at.flip - at.twist) / 2), mixed)
+        mixed, left, scaled, straight, crossed = jax.lax.optimization_barrier((mixed, left, scaled, straight, crossed))
 
-    def over_pairs(entry: Array) -> Matrix:
-        """The symmetric matrix of a number for each pair."""
-        place = {pair: entry[k] for k, pair in enumerate(la.pairs(d))}
-        return la.assemble([[place.get((min(i, j), max(i, j)), none) for j in range(d)] for i in range(d)])
+        def row(b: int, a: int) -> Array:
+            """The row of G_ab, from the diagonal on."""
+            terms = [
+                scaled[i, b, a] * mixed[i]
+                + straight[i, b][:, None] * left[i, a]
+                + mixed[i, :, a][:, None] * crossed[i, b]
+                for i in range(d)
+            ]
+            return reduce(jnp.add, terms).reshape(d * d, *s.shape[1:])[b * d + a :]
 
-    def summed(coefficients: Matrix, terms: Float[Array, "d a b *p"]) -> Float[Array, "d a b *p"]:
-        """Σ_j c_ij M_j."""
-        return (coefficients[:, :, None, None] * terms).sum(axis=1)
-
-    scaled = summed(at.scaling, mixed)
-    straight = summed(over_pairs((at.flip + at.twist) / 2), right)
-    crossed = summed(over_pairs((at.flip - at.twist) / 2), mixed)
-    mixed, left, scaled, straight, crossed = jax.lax.optimization_barrier((mixed, left, scaled, straight, crossed))
-
-    def row(b: int, a: int) -> Array:
-        """The row of G_ab, from the diagonal on."""
-        terms = [
-            scaled[i, b, a] * mixed[i] + straight[i, b][:, None] * left[i, a] + mixed[i, :, a][:, None] * crossed[i, b]
-            for i in range(d)
-        ]
-        return reduce(jnp.add, terms).reshape(d * d, *s.shape[1:])[b * d + a :]
-
-    return jnp.concatenate([row(b, a) for b in range(d) for a in range(d)])
+        return jnp.concatenate([row(b, a) for b in range(d) for a in range(d)])
 
 
 @custom_derivative
