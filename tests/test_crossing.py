@@ -11,7 +11,7 @@ from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids, thorough
 
 import mpmjax as mpm
 from mpmjax.discretisation import Stencil, _sums, gather, make_stencil, scatter
-from mpmjax.discretisation._basis import basis_of
+from mpmjax.discretisation._stencil import basis_of
 
 P = 17
 EACH_KERNEL = pytest.mark.parametrize("kernel", **ids(KERNELS))

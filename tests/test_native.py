@@ -17,7 +17,7 @@ from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 
 import mpmjax as mpm
 from mpmjax.discretisation import Stencil, _fused_sums, _sums as sums, basis_attributes, make_stencil
-from mpmjax.discretisation._basis import basis_of
+from mpmjax.discretisation._stencil import basis_of
 from mpmjax.discretisation._sums import Group
 from mpmjax.implicit import ImplicitOperator, ParticleStiffness, Projection, _solver as solver
 from mpmjax.implicit._operator import active_blocks, combine_onto, rest_of_product

@@ -1,6 +1,5 @@
 """Grid, B-spline kernels, stencils, and the transfers between particles and grid."""
 
-from mpmjax.discretisation._basis import Basis as Basis, basis_of as basis_of
 from mpmjax.discretisation._fused_sums import (
     average as average,
     resist as resist,
@@ -16,7 +15,9 @@ from mpmjax.discretisation._kernel import (
 )
 from mpmjax.discretisation._native_sums import basis_attributes as basis_attributes
 from mpmjax.discretisation._stencil import (
+    Basis as Basis,
     Stencil as Stencil,
+    basis_of as basis_of,
     first_nodes as first_nodes,
     in_window as in_window,
     make_stencil as make_stencil,

@@ -1,6 +1,7 @@
 """The background grid: a window of static shape on an unbounded lattice, placed by its integer origin."""
 
 import math
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -97,14 +98,7 @@ class Grid(eqx.Module):
 
     def with_layers(self, count: int) -> "Grid":
         """The grid with so many nodes at each place."""
-        return Grid(
-            self.shape,
-            self.spacing,
-            origin=self.origin,
-            periodic=self.periodic,
-            follow=self.follow,
-            layers=count,
-        )
+        return replace(self, layers=count)
 
     def window(self, x: ParticleVector) -> Int[Array, "d"]:
         """Lattice index of the window's first node, shape (d,), for particles at x [m], shape (p, d)."""

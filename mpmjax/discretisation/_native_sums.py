@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array
-from mpmjax.discretisation._basis import Basis
+from mpmjax.discretisation._stencil import Basis
 
 Call = Callable[..., list[Array]]
 """A kernel as a function of operands, attributes, and results if they are not those of the sum (see

@@ -31,9 +31,8 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float
 from mpmjax.autodiff import custom_derivative, is_unknown, materialised, saved_for_backward
-from mpmjax.discretisation._basis import Basis, Term, differentiated
 from mpmjax.discretisation._native_sums import call_gather, call_pull, call_scatter
-from mpmjax.discretisation._stencil import Stencil
+from mpmjax.discretisation._stencil import Basis, Stencil, Term, differentiated
 from mpmjax.discretisation._written_sums import Factors, written_gather, written_pull, written_scatter
 
 

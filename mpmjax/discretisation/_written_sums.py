@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float
-from mpmjax.discretisation._basis import Basis, Kind, Term
+from mpmjax.discretisation._stencil import Basis, Kind, Term
 
 _ROW = 4
 """Largest number of columns that are added to the nodes at once. A CPU adds one, two or four numbers as one vector;

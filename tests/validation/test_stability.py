@@ -18,8 +18,8 @@ from jax.flatten_util import ravel_pytree
 
 import mpmjax as mpm
 from mpmjax.checks._values import canonical
-from mpmjax.discretisation._basis import basis_of
 from mpmjax.discretisation._kernel import _STEEPEST
+from mpmjax.discretisation._stencil import basis_of
 from mpmjax.state._particles import state_of, with_state
 from mpmjax.stepping._step import step_unchecked
 
