@@ -52,7 +52,7 @@ def step_of(width, method, boundary):
         pytest.param(mpm.Explicit(), (), 0.55, 20, 79, id="explicit free"),
         pytest.param(mpm.SemiImplicit(), mpm.SlipBox((0.0, 0.0), (0.8, 0.8)), 0.65, 30, 150, id="semi-implicit slip"),
         pytest.param(
-            mpm.SemiImplicit(), mpm.SeparatingBox((0.0, 0.0), (0.8, 0.8)), 0.75, 39, 221, id="semi-implicit separating"
+            mpm.SemiImplicit(), mpm.SeparatingBox((0.0, 0.0), (0.8, 0.8)), 0.75, 39, 216, id="semi-implicit separating"
         ),
     ],
 )
