@@ -95,7 +95,10 @@ class VolumePreconditioner(AbstractPreconditioner):
         weight = projection.commuting_weight(weight)
         bulk = [one.average.inverse**2 * one.average.at_nodes(one.bulk) for one in averaged]
         C = operator.factor * jnp.maximum(jnp.stack(bulk), 0)
-        box = NodeBox.around((C > 0).any(axis=0), window, shape)
+        # the box begins where something is, as far as the window goes
+        lattice, axes = (C > 0).any(axis=0).reshape(window), range(len(window))
+        first = [jnp.argmax(lattice.any(axis=tuple(b for b in axes if b != a))) for a in axes]
+        box = NodeBox(window, shape, jnp.minimum(jnp.stack(first), jnp.asarray(np.subtract(window, shape))))
         C = box.inside(C)
         some = C > 0
         S = nodal_coupling(divergence.transpose, weight, some, box, half)
@@ -116,14 +119,6 @@ class NodeBox(eqx.Module):
     """Number of the box's nodes along each axis."""
     corner: Int[Array, "d"]
     """The box's first node along each axis."""
-
-    @staticmethod
-    def around(some: Bool[Array, "n"], window: tuple[int, ...], shape: tuple[int, ...]) -> "NodeBox":
-        """The box that begins where something is, as far as the window goes."""
-        lattice, axes = some.reshape(window), range(len(window))
-        first = [jnp.argmax(lattice.any(axis=tuple(b for b in axes if b != a))) for a in axes]
-        room = jnp.asarray(np.subtract(window, shape))
-        return NodeBox(window, shape, jnp.minimum(jnp.stack(first), room))
 
     def inside(self, field: Float[Array, "*a n"], spare: int = 0) -> Float[Array, "*a m"]:
         """A field of nodes (..., n) in the box and so many nodes around it, zero beyond the window."""

@@ -4,7 +4,7 @@ import abc
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property, reduce
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -98,6 +98,9 @@ class AbstractTerm(eqx.Module):
     the energy, unless the term has faster ones. `stable_dt` needs `stability_rates`.
     """
 
+    viscous: ClassVar[bool] = False
+    """Whether it has a `resistance`."""
+
     @abc.abstractmethod
     def energy(self, moved: Displacement) -> Float[Array, ""]:
         """The energy [J] at a displacement of the nodes; any constant may be added."""
@@ -120,11 +123,6 @@ class AbstractTerm(eqx.Module):
         of Newton's method avoids the others."""
         del moved
         return None
-
-    @property
-    def viscous(self) -> bool:
-        """Whether it has a `resistance`. Default: False."""
-        return False
 
     def resistance(self, velocity: Displacement) -> Forces | None:
         """D v, the force that takes a velocity of the nodes, D symmetric and positive semi-definite. Default: None."""

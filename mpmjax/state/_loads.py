@@ -180,7 +180,7 @@ class Support(AbstractSpring):
         return Forces(nodes=self.points.diagonal(self.stiffness, size))
 
     @property
-    def viscous(self) -> bool:
+    def viscous(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.damping is not None
 
     def resistance(self, velocity: Displacement) -> Forces | None:

@@ -28,7 +28,7 @@ def faces_of(
     materials, shapes, areas, explicit = potential.material_points, [], [], force_at is None
     factor = EXPLICIT_STIFFNESS if explicit else IMPLICIT_STIFFNESS
     for law, points in zip(scene.laws, materials, strict=True):
-        side = points.volume ** (1 / particles.dim)
+        side = points.volume ** (1 / potential.stencil.dim)
         shape = points.deformation if law.allows_total else points.volume_ratio()
         shapes.append(FaceShape(side / 2, shape, points.rows, points.total, law.flows))
         # of a sliver A = V0/l0 is large for its mass, and would shorten explicit steps
