@@ -342,16 +342,10 @@ def example(
     _require(names, f"There is no example {name!r}; there are {', '.join(titles)}.")
     for file in names:  # grows by the files that each names
         target, text = Path("examples", file), (folder / file).read_text(encoding="utf-8")
-        named = re.findall(r"[\w/]+\.(?:csv|toml)\b", text)
-        names += [
-            f
-            for f in dict.fromkeys(n.removeprefix("examples/") for n in named)
-            if f not in names and (folder / f).is_file()
-        ]
-        _require(
-            not target.exists() or target.read_text(encoding="utf-8") == text,
-            f"{target} exists and differs: move it away.",
-        )
+        same = not target.exists() or target.read_text(encoding="utf-8") == text
+        _require(same, f"{target} exists and differs: move it away.")
+        named = {path.removeprefix("examples/") for path in re.findall(r"[\w/]+\.(?:csv|toml)\b", text)}
+        names += sorted(path for path in named - set(names) if (folder / path).is_file())
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(text, encoding="utf-8")
         print(f"written {target}")

@@ -4,6 +4,7 @@ import dataclasses
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from textwrap import dedent
 
@@ -100,6 +101,22 @@ def test_the_snippets_of_a_page_run_in_their_order(page, tmp_path):
     code = "\n".join((*(snippets(CONTINUED[page]) if page in CONTINUED else ()), *snippets(page)))
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
+
+
+def test_toml_snippets_can_be_read_and_are_those_of_the_example():
+    """Tables of docs/fitting.md stand in examples/rubber.toml."""
+
+    def within(part, whole):
+        if isinstance(part, dict):
+            return isinstance(whole, dict) and all(k in whole and within(part[k], whole[k]) for k in part)
+        tables = isinstance(part, list) and part and isinstance(part[0], dict)
+        return all(any(within(a, b) for b in whole) for a in part) if tables else part == whole
+
+    blocks = {page: re.findall(r"```toml\n(.*?)```", p.read_text("utf-8"), re.DOTALL) for page, p in PAGES.items()}
+    tables = {page: [tomllib.loads(block) for block in each] for page, each in blocks.items()}
+    example = tomllib.loads((ROOT / "examples/rubber.toml").read_text(encoding="utf-8"))
+    assert len(tables["docs/fitting.md"]) == 2
+    assert all(within(table, example) for table in tables["docs/fitting.md"])
 
 
 def test_the_page_of_a_step_names_files_and_functions_that_exist():
