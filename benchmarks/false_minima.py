@@ -39,7 +39,10 @@ def vibration() -> None:
     seen = mpm.Tracks(times, x, which=which, sigma=2e-3)
     swing = mpm.Experiment(scene, particles, t1=PERIODS * exact.duration, dt=0.05, observations=seen)
     for share in (0.69, 0.57, 0.3, 2.5):
-        alone, staged = mpm.fit(swing, modulus(100 * share)), mpm.fitting.fit_staged(swing, modulus(100 * share))
+        alone, staged = (
+            mpm.fit(swing, modulus(100 * share), starts=1),
+            mpm.fitting.fit_staged(swing, modulus(100 * share)),
+        )
         print(
             f"vibration from {100 * share:.0f} Pa: fit {alone['E'].value:.4g} Pa; staged {staged['E'].value:.6g} Pa, "
             f"first until {staged.stages[0].horizon / exact.duration:.2f} periods, {len(staged.stages) + 1} stages",
@@ -77,9 +80,9 @@ def windows() -> None:
     whole = window(0, end, particles)
     parts = [window(k, k + WINDOW_FRAMES, state(k)) for k in range(1, end, WINDOW_FRAMES)]
     for share in (0.57, 0.3):
-        told("all data", share, mpm.fit(whole, modulus(100 * share)))
+        told("all data", share, mpm.fit(whole, modulus(100 * share), starts=1))
         told("staged", share, mpm.fitting.fit_staged(whole, modulus(100 * share)).result)
-        told(f"{len(parts)} windows of a period", share, mpm.fit(parts, modulus(100 * share)))
+        told(f"{len(parts)} windows of a period", share, mpm.fit(parts, modulus(100 * share), starts=1))
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ def identifiability(quick: bool) -> plt.Figure:
     heavier = mpm.Positive(update=lambda e, f: eqx.tree_at(lambda e: e.particles.mass, e, f * mass), start=1.1)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        alone = mpm.fit(experiment, {"E": STIFFNESS, "density": heavier})
+        alone = mpm.fit(experiment, {"E": STIFFNESS, "density": heavier}, starts=1)
     print("without a prior:", alone, *(str(w.message) for w in said), sep="\n")
     known = mpm.Positive(update=heavier.update, start=1.1, prior=prior)
     both = mpm.fit(experiment, {"E": STIFFNESS, "density": known})
@@ -133,7 +133,9 @@ def false_minima(quick: bool) -> plt.Figure:
         for start in starts:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                ends.append(mpm.fit(vibration(bar(), seen(bar(), periods, sigma), start=start), {"E": STIFFNESS})["E"])
+                ends.append(
+                    mpm.fit(vibration(bar(), seen(bar(), periods, sigma), start=start), {"E": STIFFNESS}, starts=1)["E"]
+                )
         found = np.array([e.value / E for e in ends])
         axes[1].plot(starts, found, "o-", markersize=3, linewidth=0.8, label=f"{periods:g} periods")
         right = np.abs(found - 1) < 0.02
@@ -199,7 +201,7 @@ def law(quick: bool) -> plt.Figure:
         experiment = eqx.tree_at(lambda e: e.scene.laws, experiment, (mpm.NeoHookean(E, 0.0),))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            results.append(mpm.fit(experiment, {"E": STIFFNESS}))
+            results.append(mpm.fit(experiment, {"E": STIFFNESS}, starts=1))
         e = results[-1]["E"]
         print(
             f"amplitude {amplitude:g}: E = {e.value / E:.4f} ± {e.error / E:.4f} of the true one, misfit "
@@ -235,7 +237,7 @@ def discretisation(quick: bool) -> plt.Figure:
     coarse = (1, 2) if quick else (1, 2, 4)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = [mpm.fit(vibration(exact, data, n), {"E": STIFFNESS})["E"] for n in cells]
+        found = [mpm.fit(vibration(exact, data, n), {"E": STIFFNESS}, starts=1)["E"] for n in cells]
         refined = mpm.fitting.fit_refined(lambda n: vibration(exact, data, 5 * n), {"E": STIFFNESS}, refinements=coarse)
     for n, e in zip(cells, found, strict=True):
         print(f"{n} cells: E = {e.value / E:.5f} ± {e.error / E:.5f} of the true one")

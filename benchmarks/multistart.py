@@ -4,7 +4,7 @@
     python benchmarks/multistart.py --reliability
 
 E and ν of a free square that is stretched as it starts, from tracks of all its particles with noise, made by the same
-scene; once with explicit steps, once with semi-implicit ones. Fits one by one and `fit_multistart`, with `fraction=1`,
+scene; once with explicit steps, once with semi-implicit ones. Fits one by one and one with `Starts`, with `fraction=1`,
 which searches from all points, and with its default, start from the same Sobol points, E over two decades, ν between
 its bounds. Printed are seconds of the processor and of the clock, compilation left out by a first call of each, the
 three interleaved; and of one iteration, per search, against how many run together.
@@ -27,9 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpmjax as mpm
-from mpmjax.fitting._multistart import linked, starting_points, unit_points
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import begin, iterate_together
+from mpmjax.fitting._starts import linked, starting_points, unit_points
 
 NOISE = 1e-4
 PARAMETERS = {
@@ -79,7 +79,7 @@ def one_by_one(pull: mpm.Experiment, points: np.ndarray) -> list[float]:
             name: eqx.tree_at(lambda p: p.start, p, v) for (name, p), v in zip(PARAMETERS.items(), values, strict=True)
         }
         try:
-            misfits.append(mpm.fit(pull, starts).chi_squared)
+            misfits.append(mpm.fit(pull, starts, starts=1).chi_squared)
         except (ValueError, RuntimeError):
             misfits.append(float("nan"))
     return misfits
@@ -175,7 +175,7 @@ def main() -> None:
         method, dt, steps = SCENES[name]
         pull = experiment(method, dt, steps)
         problem = FitProblem((pull,), PARAMETERS)
-        points = starting_points(problem, unit_points(given.starts - 1, problem.size, 0), {})
+        points = starting_points(problem, unit_points(given.starts - 1, problem.size, 0), mpm.fitting.Starts())
         calls = {batch: iteration(pull, points, batch) for batch in (1, 8, 32) if batch <= given.starts}
         seconds: dict[int, list[float]] = {batch: [] for batch in calls}
         for _ in range(2 + given.rounds):
@@ -183,19 +183,19 @@ def main() -> None:
                 seconds[batch].append(timed(call)[0] / batch)
         told = ", ".join(f"{batch}: {1e3 * np.median(s[1:]):.1f} ms" for batch, s in seconds.items())
         print(f"{name}: an iteration of a search of so many together, processor: {told}", flush=True)
-        mpm.fitting.fit_multistart(pull, PARAMETERS, starts=9)
-        mpm.fit(pull, PARAMETERS)
+        mpm.fit(pull, PARAMETERS, starts=9)
         for _ in range(given.rounds):
             processor, clock, alone = timed(partial(one_by_one, pull, points))
             print(f"{name}: {given.starts} fits: {processor:.1f} s of the processor, {clock:.1f} s", flush=True)
             for fraction in (1.0, 0.375):
-                call = partial(mpm.fitting.fit_multistart, pull, PARAMETERS, starts=given.starts, fraction=fraction)
-                own, own_clock, found = timed(call)
+                call = partial(mpm.fit, pull, PARAMETERS, starts=mpm.fitting.Starts(given.starts, fraction))
+                own, own_clock, result = timed(call)
+                found = result.screening
                 print(
                     f"{name}: fraction {fraction:g}: {own:.1f} s of the processor, {own_clock:.1f} s; "
                     f"ratio {processor / own:.1f}; {len(found.searched)} searches, {found.iterations} iterations; "
                     f"{len(found.minima)} minima, the best of {len(found.minima[0].members)} points, "
-                    f"{len(found.failures)} failed; χ² {found.best.chi_squared:.6g}, the fits' best "
+                    f"{len(found.failures)} failed; χ² {result.chi_squared:.6g}, the fits' best "
                     f"{np.nanmin(alone):.6g} ({sum(np.isclose(alone, np.nanmin(alone), rtol=1e-3))} of them), "
                     f"{sum(np.isnan(alone))} failed",
                     flush=True,

@@ -79,10 +79,6 @@ FUNCTIONS = {
     mpm.fitting.profile: {"result": FITTED, "label": "E"},
     mpm.fitting.predict: {"result": FITTED, "of": reached},
     mpm.fitting.predict_observations: {"result": FITTED},
-    mpm.fitting.fit_multistart: {
-        "experiments": mpm.Experiment(**RUN, observations=SEEN),
-        "parameters": {"E": STIFFNESS},
-    },
     mpm.fitting.fit_staged: {"experiments": mpm.Experiment(**RUN, observations=SEEN), "parameters": {"E": STIFFNESS}},
     mpm.fitting.fit_ensemble: {
         "experiments": [mpm.Experiment(**RUN, observations=SEEN)],

@@ -573,8 +573,9 @@ def test_two_grids_that_agree_by_chance_are_not_believed():
             y = data - h**2 * second[:, 0] - h**4 * fourth[:, 0]
             a = np.linalg.lstsq(A, y, rcond=None)[0]
             misfit = float(np.sqrt(((y - A @ a) ** 2).mean())) / noise
-            found = [Estimate(str(k), a[k], error[k], (a[k] - 2 * error[k], a[k] + 2 * error[k])) for k in (0, 1)]
-            grids.append((found, (NoiseEstimate("y", noise, False, misfit, 100),)))
+            ends = np.stack([a - 2 * error, a + 2 * error], axis=1)
+            found = [Estimate(str(k), a[k], error[k], tuple(ends[k]), noise_error=error[k]) for k in (0, 1)]
+            grids.append((found, (NoiseEstimate("y", noise, False, misfit, 100, 100.0, "", False),)))
         (coarse, before), (fine, after) = grids
         for told in held:
             missed = _missed(before, after, [1, 2], 2.0) if told else 0.0
@@ -589,7 +590,7 @@ def test_an_order_above_the_one_that_is_asked_for_does_not_narrow_the_interval()
     the correction with the first order. That of the order shown would miss the truth, which is 0."""
     for h4 in (10.0, 30.0, 100.0):
         values = [h + h4 * h**4 for h in (1.0, 0.5, 0.25)]
-        found = tuple(Estimate(str(k), value, 0.0, (value, value)) for k, value in enumerate(values))
+        found = tuple(Estimate(str(k), value, 0.0, (value, value), noise_error=0.0) for k, value in enumerate(values))
         last, left, p = _extrapolate(None, found, [1, 2, 4], 1.0, 0.0, 1.96)
         assert p == 2
         assert last.value == pytest.approx(values[2] - (values[1] - values[2]) / 3)
@@ -603,7 +604,8 @@ def test_a_number_near_or_at_its_bound_is_extrapolated_no_farther_than_that():
     nu = mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0.0, 0.49)
 
     def estimate(value, at_bound=False):
-        return Estimate("nu", value, 2e-2, (max(value - 4e-2, 0.0), value + 4e-2), at_bound=at_bound)
+        ends = max(value - 4e-2, 0.0), value + 4e-2
+        return Estimate("nu", value, 2e-2, ends, at_bound=at_bound, noise_error=2e-2)
 
     last, left, _ = _extrapolate(nu, (estimate(3e-3), estimate(5e-3)), [1, 2], 1.0, 0.0, 1.96)
     assert last.value == pytest.approx(7e-3)

@@ -10,11 +10,11 @@ import pytest
 from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
-from mpmjax.fitting._multistart import costs_at, critical_distance, linked, starting_points, unit_points
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import search, search_many
+from mpmjax.fitting._starts import costs_at, critical_distance, linked, starting_points, unit_points
 
-LM = mpm.fitting.LevenbergMarquardt()
+LM, Starts = mpm.fitting.LevenbergMarquardt(), mpm.fitting.Starts
 TIMES = np.linspace(0.001, 0.05, 40)
 
 
@@ -47,9 +47,8 @@ OMEGA = mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=500.0)
 @pytest.fixture
 def oscillation(monkeypatch):
     def fitted(gap=np.inf, **options):
-        for room in ("_multistart", "_fit"):
-            monkeypatch.setattr(f"mpmjax.fitting.{room}.FitProblem", partial(Oscillation, gap=gap))
-        return mpm.fitting.fit_multistart([], {"omega": OMEGA}, **options)
+        monkeypatch.setattr("mpmjax.fitting._fit.FitProblem", partial(Oscillation, gap=gap))
+        return mpm.fit([], {"omega": OMEGA}, starts=Starts(**options))
 
     return fitted
 
@@ -62,39 +61,41 @@ NO_DERIVATIVE = "there is no derivative"
 def test_many_starts_find_the_least_of_many_minima(oscillation, fraction):
     """ω = 400 from 500, from which a fit ends at 549. Simulations fail beyond 2000, a search from 804 has no
     derivative, and they hinder no other. Searches from fewer than half of the points stand for all, or all are."""
-    found = oscillation(gap=795.0, starts=32, fraction=fraction, ranges=RANGES, batch=5)
+    found = oscillation(gap=795.0, count=32, fraction=fraction, ranges=RANGES, batch=5)
     with pytest.warns(UserWarning, match="times the noise given"):
-        alone = mpm.fit([], {"omega": OMEGA})
+        alone = mpm.fit([], {"omega": OMEGA}, starts=1)
     assert abs(alone["omega"].value - 400) > 100
     assert found["omega"].value == pytest.approx(400, abs=4 * found["omega"].error)
-    assert len(found.minima) > 2
-    ends = [float(m.values["omega"]) for m in found.minima]
-    misfits = [m.misfit for m in found.minima]
+    look = found.screening
+    assert len(look.minima) > 2
+    ends = [float(m.values["omega"]) for m in look.minima]
+    misfits = [m.misfit for m in look.minima]
     assert misfits == sorted(misfits)
     assert min(abs(alone["omega"].value / end - 1) for end in ends) < 2e-3
-    counted = sorted(k for m in found.minima for k in m.members) + list(found.failures) + list(found.unfinished)
+    counted = sorted(k for m in look.minima for k in m.members) + list(look.failures) + list(look.unfinished)
     assert sorted(counted) == list(range(32))
-    assert found.count == 32
-    started = found.starts["omega"]
+    started = look.points["omega"]
+    assert len(started) == 32
     assert started[0] == pytest.approx(500)
     (gap,) = np.flatnonzero(abs(started - 795) < 15)
-    assert {k for k, why in found.failures.items() if why == NO_DERIVATIVE} == {gap}
-    assert set(found.failures) == {gap, *np.flatnonzero(started >= 2000)}
-    assert {0, gap} <= set(found.searched)
-    assert sum(m.searches for m in found.minima) == len(set(found.searched) - set(found.failures))
-    assert len(found.searched) == 32 if fraction == 1 else len(found.searched) < 16
-    assert f"32 points, {len(found.searched)} searches" in str(found)
+    assert {k for k, why in look.failures.items() if why == NO_DERIVATIVE} == {gap}
+    assert set(look.failures) == {gap, *np.flatnonzero(started >= 2000)}
+    assert {0, gap} <= set(look.searched)
+    assert sum(m.searches for m in look.minima) == len(set(look.searched) - set(look.failures))
+    assert len(look.searched) == 32 if fraction == 1 else len(look.searched) < 16
+    assert f"32 points, {len(look.searched)} searches" in str(found)
 
 
 def test_points_are_linked_anew_where_a_search_fails(oscillation):
     """The best point, 362, stands for all that lead to ω = 400, and has no derivative."""
     with pytest.warns(UserWarning, match="found by one search of"):
-        found = oscillation(gap=362.0, starts=32, fraction=0, ranges=RANGES, batch=5)
-    (best,) = np.flatnonzero(abs(found.starts["omega"] - 362) < 15)
-    assert best in found.searched
-    assert found.failures[best] == NO_DERIVATIVE
+        found = oscillation(gap=362.0, count=32, fraction=0, ranges=RANGES, batch=5)
+    look = found.screening
+    (best,) = np.flatnonzero(abs(look.points["omega"] - 362) < 15)
+    assert best in look.searched
+    assert look.failures[best] == NO_DERIVATIVE
     assert found["omega"].value == pytest.approx(400, abs=4 * found["omega"].error)
-    assert len(found.searched) < 10
+    assert len(look.searched) < 10
 
 
 @pytest.mark.thorough
@@ -104,7 +105,7 @@ def test_searches_from_few_points_find_what_searches_from_all_find():
     sigmas, found = problem.first_sigmas, []
     for seed in range(10):
         shares = unit_points(63, 1, seed)
-        points = starting_points(problem, shares, {"omega": (100.0, 750.0)})[1:]
+        points = starting_points(problem, shares, Starts(ranges={"omega": (100.0, 750.0)}))[1:]
         members = search_many([(problem, sigmas)], LM, dict(enumerate(points)), batch=63)
         least = np.array([m.cost for m in members.values()])
         stands = linked(shares, costs_at(problem, points, sigmas, 63), fraction=0.375)
@@ -169,7 +170,7 @@ def test_starting_points_fill_what_is_known_of_each_parameter():
         "m": mpm.Positive(lambda e: e.particles.mass, prior=mpm.fitting.Gaussian(0.01, 0.01)),
     }
     problem = FitProblem((one,), parameters)
-    points = starting_points(problem, unit_points(128, problem.size, 0), {"E": (1e3, 1e6)})
+    points = starting_points(problem, unit_points(128, problem.size, 0), Starts(ranges={"E": (1e3, 1e6)}))
     assert points.shape == (129, problem.size)
     assert not points[0].any()
     values = dict(zip(problem.names, jax.jit(jax.vmap(problem.values))(jnp.asarray(points[1:])), strict=True))
@@ -185,7 +186,7 @@ REFUSED = {
     "no parameter": ({"ranges": {"nu": (0.1, 0.2)}}, "must be of parameters"),
     "a bound": ({"ranges": {"omega": (0.0, 2.0)}}, "positive numbers"),
     "shrinking": ({"ranges": {"omega": (3.0, 2.0)}}, "must grow"),
-    "none": ({"starts": 0}, "at least 1"),
+    "none": ({"count": 0}, "at least 1"),
     "more than all": ({"fraction": 1.5}, "from 0 to 1"),
 }
 

@@ -21,7 +21,6 @@ from mpmjax.fitting import (
     FitProblem,
     Profile,
     fit,
-    fit_multistart,
     fit_refined,
     fit_staged,
     predict_observations,
@@ -152,7 +151,7 @@ def fit_scene(
     unknown = [name for name in profiles if name not in labels]
     require(not unknown, f"--profile names {unknown[:1]}, but what is fitted is {', '.join(labels)}.")
     common: dict[str, Any] = {"report": asked.report, "level": asked.level, "optimiser": asked.optimiser}
-    common |= {"log": log, "resume": resume}
+    common |= {"log": log, "resume": resume, "starts": asked.starts}
     with stopping("The fit ends after the iteration in progress; a second signal ends it at once.") as stop:
 
         def progress(line: str) -> None:
@@ -190,17 +189,12 @@ def fit_scene(
 
 
 def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> FitFile:
-    """The fit, started where many searches or a fit to growing horizons ended, if the file asks for these, to the data
-    that the horizons reach."""
-    common: dict[str, Any] = {"level": asked.level, "progress": progress, "optimiser": asked.optimiser}
-    if asked.starts > 1:
-        look = {"starts": asked.starts, "fraction": asked.fraction}
-        many = fit_multistart(asked.experiments, asked.parameters, **look, **common)
-        print(many)
-        return asked._replace(parameters=many.best.restarted(asked.parameters))
+    """The fit, started where a fit to growing horizons ended, if the file asks for these, to the data that they
+    reach."""
     if not asked.horizons:
         return asked
     times = None if asked.horizons is True else asked.horizons
+    common: dict[str, Any] = {"level": asked.level, "progress": progress, "optimiser": asked.optimiser}
     staged = fit_staged(asked.experiments, asked.parameters, horizons=times, **common)
     print(staged)
 

@@ -26,6 +26,7 @@ from mpmjax.fitting import (
     Gaussian,
     LevenbergMarquardt,
     Positive,
+    Starts,
     Unbounded,
 )
 from mpmjax.io import arguments, decode
@@ -41,8 +42,7 @@ class FitFile(NamedTuple):
     report: dict[str, Callable[[Experiment], Any]]
     level: float
     optimiser: AbstractOptimiser | None
-    starts: int  # over how many points a first guess is looked for; one for none but the file's own
-    fraction: float  # the fraction of these, the best ones, from which it is searched whatever is near
+    starts: Literal["auto"] | Starts  # from where it is searched
     horizons: tuple[float, ...] | bool  # until which times it is fitted first [s]; true to choose them, false for none
     refine: tuple[int, ...]  # on how many times as many cells a direction it is fitted besides; empty for none
     whole: tuple[Experiment, ...]
@@ -119,19 +119,20 @@ def _settings(table: dict[str, Any]) -> dict[str, Any]:
     def settings(
         *,
         level: Scalar = 0.95,
-        starts: int = 1,
+        starts: int | Literal["auto"] = "auto",
         fraction: Scalar = 0.375,
         horizons: tuple[float, ...] | bool = False,
         refine: int | tuple[int, ...] = (),
     ) -> dict[str, Any]:
         require(0 < level < 1, f"[fit] level must lie between 0 and 1, got {level!r}.")
-        require(starts > 0, f"[fit] starts must be one at least, got {starts}.")
+        many = starts != "auto" and starts > 1
+        require(starts == "auto" or starts > 0, f"[fit] starts must be one at least, got {starts}.")
         require(0 <= fraction <= 1, f"[fit] fraction must be from 0 to 1, got {fraction!r}.")
-        require(starts > 1 or "fraction" not in table, "[fit] fraction is one of starts: give these too.")
-        require(starts == 1 or not horizons, "[fit] takes either starts or horizons.")
+        require(many or "fraction" not in table, "[fit] fraction is one of starts: give these too.")
+        require(not (many and horizons), "[fit] takes either starts or horizons.")
         finer = refinements(refine if isinstance(refine, tuple) else (refine,), "[fit] refine")
-        numbers = {"level": float(level), "starts": starts, "fraction": float(fraction)}
-        return numbers | {"horizons": horizons, "refine": finer}
+        places = starts if starts == "auto" else Starts(starts, float(fraction))
+        return {"level": float(level), "starts": places, "horizons": horizons, "refine": finer}
 
     chosen = {key: value for key, value in table.items() if key in _SETTINGS}
     optimiser = _optimiser(table["optimiser"]) if "optimiser" in table else None

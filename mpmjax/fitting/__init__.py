@@ -14,11 +14,6 @@ from mpmjax.fitting._columns import (
 from mpmjax.fitting._experiment import AbstractObservation as AbstractObservation, Experiment as Experiment
 from mpmjax.fitting._field import Field as Field
 from mpmjax.fitting._fit import EnsembleFit as EnsembleFit, fit as fit, fit_ensemble as fit_ensemble
-from mpmjax.fitting._multistart import (
-    LocalMinimum as LocalMinimum,
-    MultistartFit as MultistartFit,
-    fit_multistart as fit_multistart,
-)
 from mpmjax.fitting._observation import (
     Curve as Curve,
     Force as Force,
@@ -66,3 +61,4 @@ from mpmjax.fitting._sequence import (
     fit_refined as fit_refined,
     fit_staged as fit_staged,
 )
+from mpmjax.fitting._starts import Screening as Screening, Starts as Starts

@@ -2,9 +2,11 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -17,8 +19,8 @@ from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._log import recorded
 from mpmjax.fitting._optimiser import LBFGS, LevenbergMarquardt
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem, Sigmas
-from mpmjax.fitting._result import FitResult, Noise, fit_result, settle_noise, table
+from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem, Sigmas, table
+from mpmjax.fitting._result import FitResult, Noise, fit_result, settle_noise
 from mpmjax.fitting._search import (
     NO_DERIVATIVE,
     AbstractOptimiser,
@@ -29,6 +31,8 @@ from mpmjax.fitting._search import (
     counted,
     search_many,
 )
+from mpmjax.fitting._starts import Starts, as_starts, look_around, starting_points, unit_points
+from mpmjax.fitting._uncertainty import seen_together, uncertainty
 
 
 @checked
@@ -36,6 +40,7 @@ def fit(
     experiments: Experiment | tuple[Experiment, ...] | list[Experiment],
     parameters: dict[str, AbstractParameter],
     *,
+    starts: int | Literal["auto"] | Starts = "auto",
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
     optimiser: AbstractOptimiser | None = None,
@@ -96,35 +101,79 @@ def fit(
         require(name not in problem.labels, f"What is reported must not have a parameter's name, got {name!r}.")
         shape = jnp.shape(of(problem.experiments[0]))
         require(shape == (), f"What is reported as {name!r} must be one number, got shape {shape}.")
+    starts = as_starts(starts)
+    starting_points(problem, unit_points(0, problem.size, 0), starts)  # those that cannot be are refused
+    zeros, say, paired = jnp.zeros(problem.size, problem.dtype), progress or (lambda text: None), set[str]()
     with recorded(problem, optimiser, progress, None if log is None else Path(log), resume=resume) as (past, record):
         first, earlier, sigmas, state = (0, (), problem.first_sigmas, None) if past is None else past
 
-        def minimise(number: int, starts: dict[int, Coordinates], noise: list[Sigmas]) -> dict[int, Search]:
-            return search_many(
-                [(problem, noise[0])],
-                optimiser,
-                starts,
-                state=state if number == first else None,
-                begun=lambda _, seen: require_influence(problem, noise[0], seen),
-                report=partial(record, noise[0]),
-            )
+        def begun(noise: Sigmas, number: int, seen: Evaluation) -> None:
+            """Name what the data do not see, or not apart, by the first Jacobian."""
+            require_influence(problem, noise, seen)
+            if seen.jacobian is not None and not paired:
+                errors = uncertainty(np.asarray(seen.jacobian, float), float(jnp.finfo(problem.dtype).eps), ())
+                for text in seen_together(problem.labels, errors, problem.logarithmic):
+                    paired.add(text.split(":")[0])
+                    warn(f"At the first guess, {text}")
+                    say(f"at the first guess, {text}")
 
-        ((end, settled, changing),) = _in_rounds([problem], [sigmas], minimise, first)
-    if settled is None:
+        def descend(z: Coordinates, noise: Sigmas, rounds: int = 0) -> tuple[Search, Noise | None, bool, Sigmas]:
+            """The minimum near z, the noise that it leaves, whether that still changes it, and the noise it was by."""
+
+            def minimise(_: int, starts: dict[int, Coordinates], noises: list[Sigmas]) -> dict[int, Search]:
+                nonlocal state
+                resumed, state = state, None
+                return search_many(
+                    [(problem, noises[0])],
+                    optimiser,
+                    starts,
+                    state=resumed,
+                    begun=partial(begun, noises[0]),
+                    report=partial(record, noises[0]),
+                )
+
+            noises = [noise]
+            return *_in_rounds([problem], noises, minimise, {0: z}, rounds)[0], noises[0]
+
+        def resulted(end: Search, settled: Noise) -> FitResult:
+            return fit_result(problem, optimiser, end, settled, report, level)
+
+        def enough(end: Search) -> bool:
+            """Whether a search is at a minimum that the noise explains."""
+            if end.failure or not end.converged or end.joined is not None or not starts.if_needed:
+                return False
+            return not resulted(end, settle_noise(problem, end, noise)[0]).is_beyond
+
+        end, settled, changing, noise = descend(zeros, sigmas, first)
+        result = None if settled is None else resulted(end, settled)
+        history = (*earlier, *end.history)
+        # The log of a fit that other starts have brought farther holds a search that begins where none ended.
+        brought = any(b.number == 0 and not np.array_equal(a.z, b.z) for a, b in pairwise(history))
+        needed = result is not None and result.is_beyond if starts.if_needed else True
+        screening = None
+        if not end.interrupted and not brought and needed and (starts.count > 1 or starts.points):
+            say(f"looking at other starts, {starts.count + len(starts.points)} points")
+            best, screening = look_around(problem, optimiser, starts, end, noise, enough, progress)
+            if best is not None:
+                end, settled, changing, _ = descend(best.z, problem.first_sigmas)
+                result = None if settled is None else resulted(end, settled)
+                history = (*history, *end.history)
+    if result is None:
         if end.interrupted:
             raise KeyboardInterrupt
         require_derivative(end)
-        problem.explain(jnp.zeros(problem.size, problem.dtype))
-    end = end._replace(history=(*earlier, *end.history))
-    result = fit_result(problem, optimiser, end, settled, report, level)
+        tried = "" if screening is None else f"No search of {len(screening.searched)} came to a minimum: {end.failure}."
+        problem.explain(zeros, *([tried] if tried else []))
+    result = replace(result, history=history, screening=screening)
     if not result.converged:
         stopped = "was interrupted" if result.interrupted else "did not converge"
         advice = "" if result.interrupted else f" {_ADVICE}"
         warn(f"The fit {stopped} after {len(result.history)} iterations: its errors hold only at a minimum.{advice}")
     elif changing:
         warn(f"The noise of the observations did not settle in {MOST_ROUNDS} rounds: give the sigma of one of them.")
-    for text in result.warnings:
-        warn(text)
+    for text in (*result.warnings, *([screening.remark] if screening is not None and screening.remark else [])):
+        if text.split(":")[0] not in paired:
+            warn(text)
     return result
 
 
@@ -146,18 +195,19 @@ def _in_rounds(
     problems: list[FitProblem],
     sigmas: list[Sigmas],
     minimise: Callable[[int, dict[int, Coordinates], list[Sigmas]], dict[int, Search]],
+    starts: dict[int, Coordinates],
     rounds: int = 0,
 ) -> list[tuple[Search, Noise | None, bool]]:
     """Searches of each problem, again and again until the noise that it leaves is the noise that it was made with: the
     last one, with all iterations; the noise, None where it failed; and whether that still changes the minimum.
+    `sigmas` are left as those of the last searches.
 
     `minimise` makes searches, given the number of the round, the starts by the numbers of problems, and all noise.
     """
-    starts = {k: jnp.zeros(p.size, p.dtype) for k, p in enumerate(problems)}
     histories: list[tuple[Iteration, ...]] = [()] * len(problems)
     outcomes: dict[int, tuple[Search, Noise | None, bool]] = {}
     while starts:
-        ends = minimise(rounds, starts, list(sigmas))
+        ends = minimise(rounds, starts, sigmas)
         rounds, starts = rounds + 1, {}
         for k, end in ends.items():
             histories[k] += end.history
@@ -319,7 +369,8 @@ def fit_ensemble(
         told = counted(progress, f"round {number + 1}: {{}} of {{}} fits are done")
         return search_many(list(zip(problems, sigmas, strict=True)), optimiser, starts, batch=size, progress=told)
 
-    outcomes = _in_rounds(problems, [p.first_sigmas for p in problems], minimise)
+    zeros = {k: jnp.zeros(p.size, p.dtype) for k, p in enumerate(problems)}
+    outcomes = _in_rounds(problems, [p.first_sigmas for p in problems], minimise, zeros)
     fits = [
         None if settled is None else fit_result(problem, optimiser, end, settled, dict(report or {}), level)
         for problem, (end, settled, _) in zip(problems, outcomes, strict=True)

@@ -13,8 +13,8 @@ from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
 from mpmjax.fitting._experiment import Experiment, Numbers
 from mpmjax.fitting._fit import checked_level
-from mpmjax.fitting._problem import Coordinates, FitProblem, linearised
-from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, table
+from mpmjax.fitting._problem import Coordinates, FitProblem, linearised, table
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult
 from mpmjax.fitting._search import AbstractOptimiser, batch_size, counted, search_many
 from mpmjax.fitting._uncertainty import quantile
 
@@ -135,17 +135,16 @@ def predict_observations(
         asked = tuple(e.with_observations(a.observations, a.t1) for e, a in zip(fitted, asked, strict=True))
         z = jnp.asarray(result.z, problem.dtype)
         values, derivatives = _linearised(problem, eqx.Partial(_observed, asked), z)
-    predictions, estimated = [], 0
-    each = zip(values, derivatives, observations, result.sigmas, problem.noise_is_given, strict=True)
-    for value, J, o, sigma, is_given in each:
+    predictions = []
+    each = zip(values, derivatives, observations, result.sigmas, strict=True)
+    for number, (value, J, o, sigma) in enumerate(each):
         # The noise of new measurements is the observation's own, or that of the fitted one.
         sigma = np.asarray(sigma if o.sigma is None else o.sigma, float)
         try:
             noise = np.broadcast_to(sigma, np.shape(value))
         except ValueError:
             noise = np.full(np.shape(value), np.sqrt((sigma**2).mean()))
-        predictions.append(_prediction(result, value, J, noise, None if is_given else estimated, level))
-        estimated += not is_given
+        predictions.append(_prediction(result, value, J, noise, number, level))
     return tuple(predictions)
 
 
@@ -181,11 +180,11 @@ def _prediction(
     value: Array | np.ndarray,
     J: Array | np.ndarray,
     sigma: np.ndarray | None,
-    estimated: int | None,
+    number: int | None,
     level: Scalar | None,
 ) -> Prediction:
     """Values with their bands, by their derivative J, shape (..., n). `sigma` is the noise of new measurements, if that
-    is known, `estimated` its number among those that the fit estimated."""
+    is known, `number` that of their observation, if they are of one."""
     level = checked_level(result.level if level is None else level)
     mean, gradient, errors = np.asarray(value, float), np.asarray(J, float), result.uncertainty
     has_derivative = np.asarray(np.isfinite(gradient).all(axis=-1))
@@ -200,7 +199,7 @@ def _prediction(
     if sigma is not None:
         # One observation: s² + g·C g, Student's as that of a mean. With several the noise adds to its own part alone.
         total = np.where(np.isfinite(error), error, 0) ** 2 + sigma**2
-        brought = [part + (sigma**2 if k == estimated else 0) for k, part in enumerate(errors.brought(gradient))]
+        brought = [part + (sigma**2 if k == number else 0) for k, part in enumerate(errors.brought(gradient))]
         wider = np.where(np.isfinite(error), np.sqrt(total), error)
         beyond = quantile(level, errors.freedom(total, brought)) * wider
         new_lower, new_upper = np.asarray(mean - beyond), np.asarray(mean + beyond)

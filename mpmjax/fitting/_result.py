@@ -2,7 +2,7 @@
 
 import abc
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,9 +14,11 @@ import numpy as np
 from mpmjax._types import Array
 from mpmjax.checks import require
 from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._misfit import IMPROBABLE, Shape, shape_of
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import SHOWN, Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas, table
 from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
+from mpmjax.fitting._starts import Screening
 from mpmjax.fitting._uncertainty import Uncertainty, at_bound, noise, quantile, seen_together, uncertainty
 
 
@@ -25,11 +27,13 @@ class Estimate(NamedTuple):
 
     label: str
     value: float
-    error: float  # standard error
+    error: float  # standard error, of the noise and of what the misfit shows (see `fit`)
     interval: tuple[float, float]  # where it lies at the level of the fit
     unit: str = ""
     start: float = np.nan  # the first guess
     at_bound: bool = False  # whether it came to lie at a bound, where errors mean little
+    noise_error: float = np.nan  # standard error that the noise alone makes
+    noise_interval: tuple[float, float] = (np.nan, np.nan)
 
     @property
     def name(self) -> str:
@@ -50,6 +54,9 @@ class NoiseEstimate(NamedTuple):
     estimated: bool  # whether the fit estimated it
     misfit: float  # root mean square of the residuals, in units of σ
     points: int  # how many numbers were measured
+    worth: float  # how many independent numbers they are worth, by their residuals
+    shape: str  # the shape of the residuals, "a ramp", "drifts" or "correlated"; empty where they have none
+    is_beyond: bool  # whether the misfit is beyond the noise: by χ² where that is given, by the shape where it is not
 
 
 class AbstractFit(eqx.Module):
@@ -94,6 +101,7 @@ class FitResult(AbstractFit):
     warnings: tuple[str, ...]
     """Directions that the data do not see, and a misfit that the noise does not explain, in words."""
     interrupted: bool = False  # whether Ctrl-C ended it
+    screening: Screening | None = None  # the other points from which the minimum was searched, if it was
 
     @property
     def values(self) -> dict[str, np.ndarray]:
@@ -131,6 +139,11 @@ class FitResult(AbstractFit):
     def all(self) -> tuple[Estimate, ...]:
         return (*self.estimates, *self.reported)
 
+    @property
+    def is_beyond(self) -> bool:
+        """Whether the misfit of an observation is beyond its noise."""
+        return any(noise.is_beyond for noise in self.noise)
+
     def restarted(self, parameters: Mapping[str, AbstractParameter]) -> dict[str, AbstractParameter]:
         """The parameters, to be searched from the fitted values."""
         return restarted(parameters, self.values)
@@ -166,13 +179,27 @@ class FitResult(AbstractFit):
                 f"{values.max():.4g}, median {np.median(values):.4g}; errors {errors.min():.2g} to "
                 f"{errors.max():.2g}, median {np.median(errors):.2g}"
             )
+        wider = any(e.interval != e.noise_interval for e in self.all)
         cells = [
-            (e.name, *e.cells, "" if np.isnan(e.start) else f"{e.start:>10.4g}", "at its bound" if e.at_bound else "")
+            (
+                e.name,
+                *e.cells,
+                *([f"{e.noise_interval[0]:.5g} to {e.noise_interval[1]:.5g}"] if wider else []),
+                "" if np.isnan(e.start) else f"{e.start:>10.4g}",
+                "at its bound" if e.at_bound else "",
+            )
             for e in (*rows, *self.reported)
         ]
-        head = "", f"{'value':>12} ± {'error':<9}", f"{100 * self.level:g} % interval", f"{'start':>10}", ""
+        head = "", f"{'value':>12} ± {'error':<9}", f"{100 * self.level:g} % interval"
+        head = (*head, *(["by noise alone"] if wider else []), f"{'start':>10}", "")
         noises = [
-            (n.name, f"{n.points:>12}", f"{n.sigma:.3g} {'estimated' if n.estimated else 'given'}", f"{n.misfit:.3g}")
+            (
+                n.name,
+                f"{n.points:>12}",
+                f"{n.sigma:.3g} {'estimated' if n.estimated else 'given'}",
+                f"{n.misfit:.3g}",
+                n.shape and f"{n.shape}: worth {n.worth:.2g} independent numbers",
+            )
             for n in self.noise
         ]
         first, *body = table(head, *cells)
@@ -180,26 +207,11 @@ class FitResult(AbstractFit):
         chi += "" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}"
         who = f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations"
         lost = [] if self.converged else ["NOT CONVERGED: errors hold only at a minimum."]
-        noise = table(("", f"{'numbers':>12}", "noise σ", "misfit/σ"), *noises)
-        return "\n".join([first, *many, *body, "", *noise, "", chi, who, *lost, *self.warnings])
-
-
-def table(head: Sequence[str], *rows: Sequence[str]) -> list[str]:
-    """The lines of a table, its columns as wide as they need."""
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-    widths[0] = max(widths[0], _FIRST_COLUMN)
-    return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]
-
-
-def table_of_minima(
-    head: Sequence[str], cells: Sequence[Sequence[str]], minima: Any, labels: Sequence[str]
-) -> list[str]:
-    """The lines of a table of minima: cells of each, its misfit, and the first fitted numbers."""
-    rows = []
-    for these, minimum in zip(cells, minima, strict=True):
-        numbers = np.concatenate([value.reshape(-1) for value in minimum.values.values()])
-        rows.append((*these, f"{minimum.misfit:>10.4g}", *(f"{number:>13.6g}" for number in numbers[:SHOWN])))
-    return table((*head, f"{'misfit/σ':>10}", *(f"{label:>13}" for label in labels[:SHOWN])), *rows)
+        noise = table(
+            ("", f"{'numbers':>12}", "noise σ", "misfit/σ", "residuals"[: 9 * any(n[-1] for n in noises)]), *noises
+        )
+        looked = [] if self.screening is None else ["", str(self.screening)]
+        return "\n".join([first, *many, *body, "", *noise, "", chi, who, *lost, *self.warnings, *looked])
 
 
 def restarted(
@@ -248,18 +260,37 @@ def fit_result(
     """The result at a minimum, whose residuals are in units of the noise of its search, with the noise that they
     settled; `report` and `level` as of `fit`."""
     r, J = np.array(minimum.seen.residuals, float), np.array(minimum.seen.jacobian, float)
-    z, noises, estimated = minimum.z, [], []
+    eps, z, noises, of_noise, of_misfit = float(jnp.finfo(problem.dtype).eps), minimum.z, [], [], []
     each = zip(problem.observations, problem.rows, problem.noise_is_given, settled, strict=True)
     for o, rows, is_given, (sigma, factor, freedom) in each:
         r[rows], J[rows] = r[rows] / factor, J[rows] / factor
-        sigma, misfit = np.sqrt((np.asarray(sigma) ** 2).mean()), np.sqrt((r[rows] ** 2).sum() / max(o.count, 1))
-        noises.append(NoiseEstimate(o.name, float(sigma), not is_given, float(misfit), o.count))
-        estimated += [] if is_given else [(rows, freedom)]
-    errors = uncertainty(J, float(jnp.finfo(problem.dtype).eps), estimated)
-    held = at_bound(r, J, np.asarray(problem.room(z)))
-    slope = np.asarray(jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1], float)
-    ends = intervals(problem, z, errors, (J.T @ r) * held, level)
-    columns = problem.numbers(z), np.abs(slope) * errors.error, *ends, problem.numbers(jnp.zeros_like(z)), held
+        size, misfit = np.sqrt((np.asarray(sigma) ** 2).mean()), np.sqrt((r[rows] ** 2).sum() / max(o.count, 1))
+        ratio, left = noise(r, J, rows, o.count, *o.trust)
+        # What is left of exact data is the search's and rounding's.
+        measured = misfit * size > max(_EXACT, _ROUNDINGS * eps) * o.scale() and np.isfinite(ratio)
+        improbable = is_given and o.trust == (1.0, None) and chdtrc(left, (r[rows] ** 2).sum()) < IMPROBABLE
+        x = o.against[1]
+        shape = shape_of(r[rows].reshape(len(x), -1)[np.argsort(x)]) if measured else Shape(1.0, "")
+        # A misfit that noise explains does not make a correlation larger.
+        wider = o.trust[0] * shape.factor * (ratio if improbable else min(ratio, 1)) ** 2
+        if not (measured and wider > 1):
+            wider, shape = 1.0, Shape(1.0, "")
+        freedom = freedom if not is_given else np.inf
+        of_noise.append((rows, 1.0, freedom))
+        of_misfit.append((rows, wider, freedom if wider == 1 else max(left / shape.factor, _LEAST_FREEDOM)))
+        beyond = bool(improbable or (shape.kind and not is_given))
+        worth = o.count / shape.factor
+        noises.append(
+            NoiseEstimate(o.name, float(size), not is_given, float(misfit), o.count, worth, shape.kind, beyond)
+        )
+    held, slope = at_bound(r, J, np.asarray(problem.room(z))), jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1]
+    gradient, columns = (J.T @ r) * held, [problem.numbers(z), problem.numbers(jnp.zeros_like(z)), held]
+    noise_alone, errors = (uncertainty(J, eps, noises) for noises in (of_noise, of_misfit))
+    for each in (errors, noise_alone):
+        seen = np.isfinite(each.error)
+        wider = np.where(seen, each.error, 1) / np.where(seen, noise_alone.error, 1)
+        ends = intervals(problem, z, each, gradient / wider**2, level)
+        columns += [np.abs(np.asarray(slope, float)) * each.error, np.stack(ends, axis=1)]
     numbers = zip(problem.labels, problem.owners, *(np.asarray(column).tolist() for column in columns), strict=True)
     reported = []
     for name, of in report.items():
@@ -268,10 +299,14 @@ def fit_result(
             """A function of the first experiment."""
             return jnp.asarray(of(problem.at(z)[0]))
 
-        error, freedom = errors.of(np.asarray(jax.jacfwd(value)(z), float))
-        number, reach = float(value(z)), float(quantile(level, freedom) * error)
-        interval = number - reach, number + reach
-        reported.append(Estimate(name, number, float(error), interval, start=float(value(jnp.zeros_like(z)))))
+        number, derivative, both = float(value(z)), np.asarray(jax.jacfwd(value)(z), float), []
+        for each in (errors, noise_alone):
+            error, freedom = each.of(derivative)
+            reach = float(quantile(level, freedom) * error)
+            both.append((float(error), (number - reach, number + reach)))
+        start = float(value(jnp.zeros_like(z)))
+        (error, ends), (by_noise, noise_ends) = both
+        reported.append(Estimate(name, number, error, ends, "", start, False, by_noise, noise_ends))
     degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
     result = FitResult(
         problem=problem,
@@ -281,8 +316,8 @@ def fit_result(
         jacobian=J,
         uncertainty=errors,
         estimates=tuple(
-            Estimate(label, value, error, (a, b), owner.unit, start, bound)
-            for label, owner, value, error, a, b, start, bound in numbers
+            Estimate(label, value, error, tuple(ends), owner.unit, start, bound, of_noise, tuple(noise_ends))
+            for label, owner, value, start, bound, error, ends, of_noise, noise_ends in numbers
         ),
         reported=tuple(reported),
         chi_squared=float((r**2).sum()),
@@ -296,13 +331,17 @@ def fit_result(
         warnings=tuple(seen_together(problem.labels, errors, problem.logarithmic)),
         interrupted=minimum.interrupted,
     )
-    if result.p_value < _IMPROBABLE:
-        text = (
+    texts = list(result.warnings)
+    if result.p_value < IMPROBABLE:
+        texts.append(
             f"The misfit is {np.sqrt(result.chi_squared / result.degrees_of_freedom):.2g} times the noise given: the "
-            "model or its discretisation does not explain the data, and the errors are too small by as much or more."
+            "model or its discretisation does not explain the data. Errors are so many times those of the noise."
         )
-        result = replace(result, warnings=(*result.warnings, text))
-    return result
+    for n in noises:
+        if n.shape:
+            worth = f"{n.points} numbers are worth {n.worth:.2g} independent ones"
+            texts.append(f"The residuals of {n.name!r} {_SHAPES[n.shape]}. Errors are larger as {worth}.")
+    return replace(result, warnings=tuple(texts))
 
 
 def intervals(
@@ -334,9 +373,17 @@ def intervals(
     return np.clip(lower, *ends), np.clip(upper, *ends)
 
 
-_FIRST_COLUMN = 24
 _MOST_ROWS = 12  # numbers of one parameter up to which each has a row of the table
-_IMPROBABLE = 1e-3  # probability of a χ² from which the model is said not to explain the data
+_SHAPES = {
+    "a ramp": "show a ramp: look at the drift and the zero of what measured, and at loads and the start of the run",
+    "drifts": "drift: look at the law, at its damping, and for another minimum",
+    "correlated": "are correlated: look at their picture, for a motion that law or grid miss, or smoothed data",
+}
+_EXACT = 1e-6  # misfit, in sizes of the data, below which data are exact
+_ROUNDINGS = 100  # the same in roundings
+_LEAST_FREEDOM = 4.0
+"""Degrees of freedom of a misfit that few independent numbers show, at least: fewer would widen an interval beyond what
+the factor, which errs to the safe side, asks for."""
 _BESIDE = 3  # reaches of an interval within which it is beside a bound
 _NOISE_RTOL = 1e-3  # the noise of several observations is settled when its estimate changes less, relatively
 _LEAST = 1e-12  # smallest noise, in sizes of the data: exact data have none

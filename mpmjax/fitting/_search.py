@@ -110,6 +110,8 @@ def search_many(
     joining: float = 0.0,
     settling: float = 0.0,
     state: Search | None = None,
+    done: Mapping[int, Search] | None = None,
+    enough: Callable[[Search], bool] = lambda search: False,
     progress: Callable[[int, int], None] = lambda done, count: None,
     begun: Callable[[int, Evaluation], None] = lambda number, seen: None,
     report: Callable[[Search], None] = lambda state: None,
@@ -128,12 +130,15 @@ def search_many(
             than this part of it: Gauss-Newton steps are slow where residuals are large, as at false minima. Zero ends
             none.
         state: in the place of its start, an earlier state of the first search, which is continued exactly.
+        done: earlier searches, by their numbers, which are returned with the others.
+        enough: says of each search that has ended whether those that wait need not begin; they are left out.
         progress: called with how many are done, and of how many.
         begun: called with the number of a search and the evaluation where it starts, unless it fails there.
         report: called after each iteration of each search.
     """
     stacked = _stacked(problems)
-    waiting, done = deque(starts), dict[int, Search]()
+    waiting, done = deque(starts), dict(done or {})
+    before = len(done)
     running: dict[int, Search | None] = {} if state is None else {waiting.popleft(): state}
 
     def end(k: int, search: Search, **outcome: Any) -> None:
@@ -171,11 +176,13 @@ def search_many(
                     if near:
                         end(k, search, joined=near[0])
             if states:
-                progress(len(done), len(starts))
+                progress(len(done) - before, len(starts))
+            if any(enough(done[k]) for k in states if k in done):
+                waiting.clear()
             while waiting and len(running) < batch:
                 running[waiting.popleft()] = None
             if not running:
-                return {k: done[k] for k in starts}
+                return dict(sorted(done.items()))
             states = _iterated(problems, stacked, optimiser, starts, running, batch)
             running = {**states}
             for k, search in states.items():
@@ -188,7 +195,8 @@ def search_many(
             if search is not None:
                 end(k, search, interrupted=True)
     none = Search(jnp.zeros(0), None, Evaluation(jnp.zeros(()), jnp.zeros(0)), ())
-    return {k: done.get(k, none._replace(interrupted=True, failure=_NOT_BEGUN)) for k in starts}
+    begun_none = {k: none._replace(interrupted=True, failure=_NOT_BEGUN) for k in starts}
+    return dict(sorted((begun_none | done).items()))
 
 
 def _of(problems: Sequence[tuple[FitProblem, Sigmas]], k: int) -> tuple[FitProblem, Sigmas]:

@@ -3,9 +3,10 @@
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,9 +19,10 @@ from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import chosen_optimiser, fit, require_derivative
 from mpmjax.fitting._observation import Series
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem
-from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, NoiseEstimate, restarted, table, table_of_minima
+from mpmjax.fitting._problem import Coordinates, FitProblem, table, table_of_minima
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, NoiseEstimate, restarted
 from mpmjax.fitting._search import AbstractOptimiser, begin, iterate, jacobian, search
+from mpmjax.fitting._starts import Starts, as_starts
 from mpmjax.fitting._uncertainty import quantile
 
 
@@ -213,6 +215,7 @@ class RefinedFit(AbstractFit):
     from_noise: tuple[float, ...]  # the part of each error that the data's noise makes
     from_discretisation: tuple[float, ...]  # the part that is left of the discretisation
     order: tuple[float, ...]  # the order in the spacing with which each was extrapolated; NaN of what does not converge
+    remark: str = ""  # whether a misfit beyond the noise falls with the spacing, in words; empty where there is none
 
     @property
     def all(self) -> tuple[Estimate, ...]:
@@ -232,7 +235,8 @@ class RefinedFit(AbstractFit):
         for n, each in zip(self.refinements, self.fits, strict=True):
             lines += [f"spacing/{n}: {text}" for text in each.warnings]
             lines += [] if each.converged else [f"spacing/{n}: NOT CONVERGED"]
-        return "\n".join(lines)
+            lines += [] if each.screening is None else [f"spacing/{n}: {each.screening}"]
+        return "\n".join([*lines, *([self.remark] if self.remark else [])])
 
 
 @checked
@@ -242,6 +246,7 @@ def fit_refined(
     *,
     refinements: tuple[int, ...] | list[int] = (1, 2),
     order: Scalar = 1,
+    starts: int | Literal["auto"] | Starts = "auto",
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
     optimiser: AbstractOptimiser | None = None,
@@ -279,6 +284,8 @@ def fit_refined(
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
         refinements: the n, growing, two at least. Each fit starts from the one before.
         order: p, the order in the spacing. One is careful: estimates that converge faster get a wider interval.
+        starts: of the first grid, see `fit`. Finer ones start from all minima of the one before, and from others, where
+            their misfit is beyond the noise.
         parameters, report, level, optimiser, progress, resume: see `fit`.
         log: the name of the logs, one a grid: of "fit.h5" they are "fit_1.h5", "fit_2.h5". See `fit`.
 
@@ -292,12 +299,13 @@ def fit_refined(
     )
     require_positive("order", order)
     fits: list[FitResult] = []
-    start = parameters
+    start, places = parameters, as_starts(starts)
     for n in numbers:
         path = None if log is None else Path(log).with_stem(f"{Path(log).stem}_{n}")
         result = fit(
             build(n),
             start,
+            starts=places,
             report=report,
             level=level,
             optimiser=optimiser,
@@ -310,6 +318,8 @@ def fit_refined(
         if result.interrupted:
             break
         start = result.restarted(parameters)
+        minima = () if result.screening is None else result.screening.minima
+        places = replace(places, points=tuple(m.values for m in minima), if_needed=True)
     numbers = numbers[: len(fits)]
     if len(fits) < len(refinements):
         warn(f"The fit on several grids was interrupted: of {len(refinements)} grids it tells of {len(fits)}.")
@@ -317,9 +327,31 @@ def fit_refined(
     each = zip(kinds, zip(*(result.all for result in fits), strict=True), strict=True)
     normal = float(quantile(float(level), np.inf))
     missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order)) if len(fits) > 1 else 0.0
+    remark = ""
+    if len(fits) > 1 and fits[-1].is_beyond:
+        before, after = _squares(fits[-2].noise, fits[-1].noise)
+        points = sum(n.points for n in fits[-1].noise)
+        by_noise = sum(n.points for n in fits[-1].noise if not n.estimated)
+        falls = after - by_noise < _FALLS * (before - by_noise)
+        shown = f"{np.sqrt(before / points):.3g} σ on {numbers[-2]}, {np.sqrt(after / points):.3g} σ on {numbers[-1]}"
+        remark = (
+            f"The misfit falls with the spacing ({shown}): it is the discretisation's. Go on to a finer grid."
+            if falls
+            else f"The misfit does not fall with the spacing ({shown}): this is a false minimum or a wrong model, and "
+            "not the discretisation. Take more starts, or another law."
+        )
+        warn(remark)
     extrapolated = [_extrapolate(kind, of, numbers, float(order), missed, normal) for kind, of in each]
     estimates, left, orders = zip(*extrapolated, strict=True)
-    return RefinedFit(tuple(fits), tuple(numbers), estimates, tuple(e.error for e in fits[-1].all), left, orders)
+    return RefinedFit(
+        tuple(fits), tuple(numbers), estimates, tuple(e.error for e in fits[-1].all), left, orders, remark
+    )
+
+
+def _squares(coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...]) -> tuple[float, float]:
+    """Σ r² on two grids, in units of the finer one's σ."""
+    before = sum(b.points * (a.misfit * a.sigma / b.sigma) ** 2 for a, b in zip(coarse, fine, strict=True))
+    return before, sum(b.points * b.misfit**2 for b in fine)
 
 
 def _missed(
@@ -327,9 +359,8 @@ def _missed(
 ) -> float:
     """D, by how much the finest grid misses the data beyond their noise, in units of its σ: by what the sum of squares
     lost since the grid before, as the square of what falls with the spacing to the power of the order."""
-    pairs = zip(coarse, fine, strict=True)
-    lost = sum(b.points * ((a.misfit * a.sigma / b.sigma) ** 2 - b.misfit**2) for a, b in pairs)
-    return float(np.sqrt(max(lost, 0.0) / ((refinements[-1] / refinements[-2]) ** (2 * order) - 1)))
+    before, after = _squares(coarse, fine)
+    return float(np.sqrt(max(before - after, 0.0) / ((refinements[-1] / refinements[-2]) ** (2 * order) - 1)))
 
 
 def _extrapolate(
@@ -366,7 +397,7 @@ def _extrapolate(
         p = float(np.clip(np.log(shrinks) / np.log(ratio), order / 2, 2 * order)) if shrinks > 1 else float("nan")
     correction = 0.0 if np.isnan(p) else change / (ratio**p - 1)
     value = back(correction)
-    hidden = missed / 2 * last.error / (last.value if logarithmic else 1)
+    hidden = missed / 2 * last.noise_error / (last.value if logarithmic else 1)
     remains = max(abs(change) / (1 if np.isnan(p) else ratio ** min(p, order) - 1), hidden)
     if np.isnan(p):
         shown = ", ".join(f"{e.value:.5g}" for e in estimates)
@@ -389,4 +420,7 @@ def _extrapolate(
 _MOST_STAGES = 20
 _NEARLY_ALL = 0.75  # a horizon beyond this part of the end is the end
 _LEAST_TIMES = 4  # how many measured times the first horizon has, at least
+_FALLS = (
+    0.7  # part of a misfit's squares beyond the noise, below which it falls with the spacing; of order 1/2 one half
+)
 _GROWN = 1.2  # a ratio that grows by no more than this factor does not grow

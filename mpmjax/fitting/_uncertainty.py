@@ -21,14 +21,15 @@ class Uncertainty(NamedTuple):
     """The covariance of n coordinates at a minimum, by the Gauss-Newton Hessian."""
 
     inverse: np.ndarray
-    """The pseudo-inverse of JᵀJ, shape (n, n): the covariance, but in directions that the data do not see."""
+    """The covariance, but in directions that the data do not see, shape (n, n); of noise alone the pseudo-inverse of
+    JᵀJ."""
     unseen: np.ndarray  # directions that the data do not see, one a column, shape (n, u)
     weak: np.ndarray
     """Directions that the data hardly see, a tenth as well as each coordinate alone, one a column, shape (n, w)."""
     spectrum: np.ndarray  # the eigenvalues of the Fisher information JᵀJ, growing, shape (n,)
     directions: np.ndarray  # their eigenvectors, one a column, shape (n, n)
-    parts: tuple[np.ndarray, ...]  # the part of the covariance of each observation whose noise was estimated, (n, n)
-    freedoms: tuple[float, ...]  # the degrees of freedom of each of these estimates
+    parts: tuple[np.ndarray, ...]  # the part of the covariance that each observation brings, (n, n)
+    freedoms: tuple[float, ...]  # degrees of freedom of the noise of each; infinite where it is known
 
     @property
     def rank(self) -> int:
@@ -76,11 +77,11 @@ class Uncertainty(NamedTuple):
         return np.asarray(np.sqrt(np.where(depends, np.inf, variance))), freedom
 
     def brought(self, gradient: np.ndarray) -> list[np.ndarray]:
-        """The part of their variance that each observation brings whose noise was estimated."""
+        """The part of their variance that each observation brings."""
         return [quadratic(gradient, part) for part in self.parts]
 
     def freedom(self, variance: np.ndarray, brought: list[np.ndarray]) -> np.ndarray:
-        """The degrees of freedom of a variance, of which the estimated noise of observations brought parts."""
+        """The degrees of freedom of a variance, of which the noise of observations brought parts."""
         return _ratio(variance**2, sum(v**2 / f for v, f in zip(brought, self.freedoms, strict=True)))
 
 
@@ -104,9 +105,11 @@ def quantile(level: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray
     return np.where(normal, ndtri(p), stdtrit(np.where(normal, 1, degrees_of_freedom), p))
 
 
-def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, float]]) -> Uncertainty:
+def uncertainty(J: np.ndarray, eps: float, noises: Sequence[tuple[slice, float, float]]) -> Uncertainty:
     """The uncertainty of the coordinates by J, the derivative of residuals in units of their noise, shape (m, n), of
-    precision `eps`; `estimated` are rows and degrees of freedom of each observation whose noise was estimated."""
+    precision `eps`. `noises` are of each observation its rows, the factor by which the variance of its residuals is
+    larger than one, and the degrees of freedom with which that is known: with factors c_k it is the covariance
+    (JᵀJ)⁻¹ Σ c_k J_kᵀJ_k (JᵀJ)⁻¹ (H. White, Econometrica 48 (1980) 817, doi 10.2307/1912934)."""
     n = J.shape[1]
     length = np.linalg.norm(J, axis=0)
     length = np.where(length == 0, 1, length)
@@ -119,8 +122,10 @@ def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, floa
     unseen = (Vt[~seen] / length).T
     weak = (Vt[seen & (values < np.sqrt(1 - _NEARLY_ONE))] / length).T
     spectrum, directions = np.linalg.eigh(J.T @ J)
-    parts = tuple(inverse @ J[rows].T @ J[rows] @ inverse for rows, _ in estimated)
-    freedoms = tuple(freedom for _, freedom in estimated)
+    parts = tuple(inverse @ J[rows].T @ J[rows] @ inverse for rows, *_ in noises)
+    inverse = inverse + sum((c - 1) * part for (_, c, _), part in zip(noises, parts, strict=True))
+    parts = tuple(c * part for (_, c, _), part in zip(noises, parts, strict=True))
+    freedoms = tuple(freedom for *_, freedom in noises)
     unseen, weak = (a / np.maximum(np.linalg.norm(a, axis=0), np.finfo(float).tiny) for a in (unseen, weak))
     return Uncertainty(inverse, unseen, weak, np.maximum(spectrum, 0), directions, parts, freedoms)
 

@@ -1,9 +1,9 @@
-"""Fits from many starting points, and the minima that they lead to."""
+"""Searches from many starting points, and the minima that they lead to."""
 
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -12,16 +12,73 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, Scalar
-from mpmjax.checks import checked, require, require_between, require_finite, require_whole, warn
-from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._fit import chosen_optimiser, fit, require_influence
-from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
-from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, restarted, table_of_minima
-from mpmjax.fitting._search import AbstractOptimiser, Evaluation, Search, batch_size, counted, search_many
+from mpmjax.checks import require, require_between, require_fields, require_finite, require_whole
+from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas, table_of_minima
+from mpmjax.fitting._search import AbstractOptimiser, Search, batch_size, counted, search_many
 
-Ranges = Mapping[str, tuple[float, float]]  # lowest and highest value to start from, by the name of a parameter
 Ends = list[tuple[Search, list[int]]]  # minima, with the numbers of the points that led there
+
+
+class Starts(eqx.Module):
+    """Where `fit` starts, besides its first guess.
+
+        result = mpm.fit(pull, {"E": ...}, starts=mpm.fitting.Starts(64, ranges={"E": (1e4, 1e7)}))
+        print(result)
+
+    The points are the first guess, `points` of your own, and scrambled Sobol points (see `ranges`). The simulation runs
+    once at each of them, without derivatives. Searches start from the first guess, from your own points, from a
+    fraction of the others, the best ones, and from each that has no better one within the critical distance of
+    multi-level single linkage (A. H. G. Rinnooy Kan, G. T. Timmer, Mathematical Programming 39 (1987) 57-78). They
+    stand for the others, each of which is linked to the nearest better one. Where a search comes to no minimum, the
+    points that it stood for are linked anew, without it.
+
+    Points and searches whose simulation fails hinder no others. A search that comes within a hundredth, in each
+    coordinate, of another with a lower cost is ended, and counted where that one ends; one whose sum of squares three
+    moves, or six iterations, have lowered by less than a hundredth is ended there, as at a minimum. Those that come
+    within twice the least sum of squares are searched on, and the best is then fitted as from a single start.
+
+    Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the misfit
+    hides the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, J and s² = Σ r²/(m − n), or one if σ is given and that is
+    less, being those of the better one. Where σ is not given, all searches take that of the first one.
+
+    Args:
+        count: how many points, the first guess among them, your own not.
+        fraction: of the points, the best ones, from which searches start whatever is near. 1 searches from all of them,
+            without a look; 0 only from those of single linkage and the first guess.
+        ranges: lowest and highest value to start from, by the name of a parameter. Default: its prior, or its bounds,
+            from a tenth to ten times the first guess of a `Positive`, one coordinate each way of an `Unbounded` one.
+        points: values by the names of parameters from which a search starts whatever is near; the first guess of those
+            that are not named.
+        if_needed: look at them only where the misfit of the fit from the first guess is beyond the noise; searches then
+            run one by one, the best points first, until the misfit of one is within the noise.
+        seed: of the Sobol points.
+        batch: how many points, and searches, run together. Default: eight with explicit steps, one with implicit ones.
+
+    Raises:
+        ValueError: no point; a fraction beyond 0 to 1. `fit` refuses ranges and points of no parameter, or outside of
+            its bounds.
+    """
+
+    count: int = 64
+    fraction: Scalar = 0.375
+    ranges: Mapping[str, tuple[float, float]] | None = eqx.field(default=None, kw_only=True)
+    points: tuple[Mapping[str, Any], ...] = eqx.field(default=(), kw_only=True)
+    if_needed: bool = eqx.field(default=False, kw_only=True)
+    seed: int = eqx.field(default=0, kw_only=True)
+    batch: int | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self):
+        require_fields(self)
+        require_whole("starts", self.count, 1)
+        require_between("fraction", self.fraction, 0, 1)
+        require_whole("seed", self.seed, 0)
+
+
+def as_starts(starts: int | Literal["auto"] | Starts) -> Starts:
+    """The starts that `fit` was asked for."""
+    if starts == "auto":
+        return Starts(_AUTOMATIC, 1 / 8, if_needed=True)
+    return starts if isinstance(starts, Starts) else Starts(starts)
 
 
 class LocalMinimum(NamedTuple):
@@ -33,165 +90,110 @@ class LocalMinimum(NamedTuple):
     members: tuple[int, ...]  # the numbers, from 0, of the points that these searches stand for; the first guess is 0
 
 
-class MultistartFit(AbstractFit):
-    """The best of many fits, and the other minima; `result["E"]` is the estimate of a parameter by the best."""
+class Screening(eqx.Module):
+    """Points at which the simulation was tried, searches from some of them, and the minima that these found."""
 
-    best: FitResult  # the fit from the best minimum, with its errors
     minima: tuple[LocalMinimum, ...]  # the distinct minima, the best first
-    starts: dict[str, np.ndarray]  # the points: the values of each parameter, shape (k, ...)
+    points: dict[str, np.ndarray]  # the values of each parameter, shape (k, ...); the first guess is number 0
     searched: tuple[int, ...]  # the numbers of the points from which searches started
     failures: dict[int, str]  # why the simulation at a point, or the search from it, failed, by the number of the point
     unfinished: tuple[int, ...]
     """The numbers of the points from which no search came to a minimum within the optimiser's steps."""
     iterations: int  # how many iterations all searches took
-
-    @property
-    def all(self) -> tuple[Estimate, ...]:
-        return self.best.all
-
-    @property
-    def count(self) -> int:
-        """Number of points."""
-        return len(next(iter(self.starts.values())))
+    remark: str  # what is to be said of it, in words; empty if nothing
 
     def __str__(self) -> str:
-        """The table of the best fit, then one of the minima."""
-        minima, labels = self.minima[:_SHOWN], self.best.problem.labels
+        """A table of the minima."""
+        minima, count = self.minima[:_SHOWN], len(next(iter(self.points.values())))
+        labels = [name if v.ndim == 1 else f"{name}[…]" for name, v in self.points.items()]
         cells = [(f"{len(m.members):>24}", f"{m.searches:>8}") for m in minima]
-        counts = f"{self.count} points, {len(self.searched)} searches, {self.iterations} iterations"
         rows = table_of_minima((f"{'points':>24}", "searches"), cells, minima, labels)
-        lines = [str(self.best), "", counts, *rows]
+        lines = [f"{count} points, {len(self.searched)} searches, {self.iterations} iterations", *rows]
         if len(self.minima) > _SHOWN:
             lines.append(f"and {len(self.minima) - _SHOWN} minima with a larger misfit.")
         if self.unfinished:
-            lines.append(f"{len(self.unfinished)} of {self.count} points led to no minimum.")
+            lines.append(f"{len(self.unfinished)} of {count} points led to no minimum.")
         if self.failures:
             shown = ", ".join(map(str, list(self.failures)[:_SHOWN])) + (", …" if len(self.failures) > _SHOWN else "")
-            lines.append(f"{len(self.failures)} of {self.count} points failed, number {shown}.")
+            lines.append(f"{len(self.failures)} of {count} points failed, number {shown}.")
         return "\n".join(lines)
 
 
-@checked
-def fit_multistart(
-    experiments: Experiment | tuple[Experiment, ...] | list[Experiment],
-    parameters: dict[str, AbstractParameter],
-    *,
-    starts: int = 64,
-    fraction: Scalar = 0.375,
-    ranges: dict[str, tuple[float, float]] | None = None,
-    seed: int = 0,
-    batch: int | None = None,
-    report: dict[str, Callable[[Experiment], Any]] | None = None,
-    level: Scalar = 0.95,
-    optimiser: AbstractOptimiser | None = None,
-    progress: Callable[[str], None] | None = None,
-) -> MultistartFit:
-    """Look over many points for where fits start: the best minimum, with its errors, and what other minima there are.
-
-        result = mpm.fitting.fit_multistart(pull, {"E": ...}, starts=64, ranges={"E": (1e4, 1e7)})
-        print(result)
-
-    The points are the first guess and scrambled Sobol points (see `ranges`). The simulation runs once at each of them,
-    without derivatives. Searches start from the first guess, from a fraction of the points, the best ones, and from
-    each that has no better one within the critical distance of multi-level single linkage (A. H. G. Rinnooy Kan, G. T.
-    Timmer, Mathematical Programming 39 (1987) 57-78). They stand for the others, each of which is linked to the nearest
-    better one. Where a search comes to no minimum, the points that it stood for are linked anew, without it.
-
-    Searches run together, `batch` in one compiled program. Points and searches whose simulation fails hinder no others.
-    A search that comes within a hundredth, in each coordinate, of another with a lower cost is ended, and counted where
-    that one ends; one whose sum of squares three moves, or six iterations, have lowered by less than a hundredth is
-    ended there, as at a minimum. Those that come within twice the least sum of squares are searched on, and the best is
-    then fitted as `fit` does.
-
-    Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the misfit
-    hides the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, J and s² = Σ r²/(m − n), or one if σ is given and that is
-    less, being those of the better one. Where σ is not given, searches take the size of the data in its place: several
-    observations without one weigh alike in them, and are only weighed by their noise in the last fit.
-
-    Args:
-        experiments, parameters, report, level: see `fit`.
-        starts: how many points, the first guess among them.
-        fraction: of the points, the best ones, from which searches start whatever is near. 1 searches from all of them,
-            without a look; 0 only from those of single linkage and the first guess.
-        ranges: lowest and highest value to start from, by the name of a parameter. Default: its prior, or its bounds,
-            from a tenth to ten times the first guess of a `Positive`, one coordinate each way of an `Unbounded` one.
-        seed: of the starting points.
-        batch: how many points, and searches, run together. Default: eight with explicit steps, one with implicit ones.
-        optimiser: the method of each search, and of the last fit. Default: as `fit` chooses.
-        progress: called with a line, such as `print`, as points are done, as searches end, and by the last fit.
-
-    Raises:
-        ValueError: as `fit`; a range of no parameter, or outside of its bounds; no search that came to a minimum.
-        SimulationError: no search came to a minimum, and the simulation at the first guess meets a fault.
-    """
-    require_whole("starts", starts, 1)
-    require_between("fraction", fraction, 0, 1)
-    problem = FitProblem(experiments, parameters)
-    optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
-    shares = unit_points(starts - 1, problem.size, require_whole("seed", seed, 0))
-    points = starting_points(problem, shares, dict(ranges or {}))
-    sigmas, size, costs = problem.first_sigmas, batch_size(problem, batch, starts), np.zeros(starts)
-    if fraction < 1:
+def look_around(
+    problem: FitProblem,
+    optimiser: AbstractOptimiser,
+    starts: Starts,
+    first: Search,
+    sigmas: Sigmas,
+    enough: Callable[[Search], bool],
+    progress: Callable[[str], None] | None,
+) -> tuple[Search | None, Screening]:
+    """The best minimum of searches from many points, None where there is none better than that of the `first` search,
+    and what was found. `enough` says of a search whether others need not begin."""
+    shares = unit_points(starts.count - 1, problem.size, starts.seed)
+    points = starting_points(problem, shares, starts)
+    apart, size = len(points) - len(shares), batch_size(problem, starts.batch, len(points))
+    costs = np.zeros(len(points))
+    if starts.fraction < 1:
         told = counted(progress, "{} of {} simulations are done", again=False)
         costs = costs_at(problem, points, sigmas, size, told)
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
-    together = partial(search_many, [(problem, sigmas)], optimiser, batch=size, joining=_JOINED)
-
-    def begun(number: int, seen: Evaluation) -> None:
-        if number == 0:
-            require_influence(problem, sigmas, seen)
+    # A program that makes one iteration is compiled already.
+    size = 1 if starts.if_needed and starts.batch is None else size
+    together = partial(search_many, [(problem, sigmas)], optimiser, batch=size)
 
     # Searches from the points that stand for others, until each point is stood for by one that came to a minimum.
-    members: dict[int, Search] = {}
+    members: dict[int, Search] = {0: first}
     while True:
-        # The first guess, which is none of the cube's points, stands for itself.
-        others = linked(shares, costs[1:], fraction)
-        stands = [0 if np.isfinite(costs[0]) else -1, *np.where(others < 0, -1, others + 1).tolist()]
-        chosen = sorted(set(stands) - {-1, *members}, key=lambda k: (k > 0, costs[k]))
+        # The first guess and points of one's own are none of the cube's, and stand for themselves.
+        others = linked(shares, costs[apart:], starts.fraction)
+        alone = np.where(np.isfinite(costs[:apart]), np.arange(apart), -1)
+        stands = [*alone.tolist(), *np.where(others < 0, -1, others + apart).tolist()]
+        chosen = sorted(set(stands) - {-1, *members}, key=lambda k: (k >= apart, costs[k]))
         if not chosen:
             break
         told = counted(progress, "{} of {} searches are done", again=False)
-        members |= together({k: points[k] for k in chosen}, settling=_SETTLED, progress=told, begun=begun)
-        if any(m.interrupted for m in members.values()):
+        from_there = {k: points[k] for k in chosen}
+        members = together(from_there, joining=_JOINED, settling=_SETTLED, progress=told, done=members, enough=enough)
+        if any(m.interrupted or enough(m) for m in members.values()):
             break
         costs[[k for k in chosen if _end(members, k) is None]] = np.nan
     failures |= {k: m.failure for k, m in members.items() if m.failure}
     ends: dict[int, list[int]] = {}
     for k, by in enumerate(stands):
-        if by >= 0 and (end := _end(members, by)) is not None:
+        if by in members and (end := _end(members, by)) is not None:
             ends.setdefault(end, []).append(k)
-    groups = _grouped(problem, [(members[end], numbers) for end, numbers in ends.items()])
-    if not groups:
-        failure = f"No search of {len(members)} came to a minimum: {failures.get(0, 'raise max_steps')}."
-        problem.explain(jnp.zeros(problem.size, problem.dtype), failure)
-    # Those near to the best one are searched on, without settling.
-    near = sum(end.cost <= _NEAR_BEST * groups[0][0].cost for end, _ in groups[:_SHOWN])
-    further = together({k: groups[k][0].z for k in range(near)})
-    on = [(groups[k][0] if m.failure else m, groups[k][1]) for k, m in further.items()]
-    groups = _grouped(problem, [*on, *groups[near:]])
+    groups, further = _grouped(problem, [(members[end], numbers) for end, numbers in ends.items()]), {}
+    if not starts.if_needed:
+        # Those near to the best one are searched on, without settling.
+        near = [k for k, (end, _) in enumerate(groups[:_SHOWN]) if end.cost <= _NEAR_BEST * groups[0][0].cost]
+        further = together({k: groups[k][0].z for k in near if groups[k][0] is not first})
+        on = [(groups[k][0] if m.failure else m, groups[k][1]) for k, m in further.items()]
+        groups = _grouped(problem, [*on, *(group for k, group in enumerate(groups) if k not in further)])
     minima = tuple(
         LocalMinimum(
             problem.by_name(end.z), problem.misfit(end.cost), len(members.keys() & numbers), tuple(sorted(numbers))
         )
         for end, numbers in groups
     )
-    start = restarted(parameters, minima[0].values)
-    best = fit(experiments, start, report=report, level=level, optimiser=optimiser, progress=progress)
-    ended = {k for _, numbers in groups for k in numbers}
-    if minima[0].searches == 1 and len(ended & members.keys()) > 1:
-        warn(
+    ended, remark = {k for _, numbers in groups for k in numbers}, ""
+    if minima and minima[0].searches == 1 and len(ended & members.keys()) > 1 and not starts.if_needed:
+        remark = (
             f"The best minimum was found by one search of {len(members)}: there may be a better one. Take more starts, "
             "a larger fraction, or narrower ranges."
         )
     values = [problem.by_name(jnp.asarray(point, problem.dtype)) for point in points]
-    return MultistartFit(
-        best=best,
+    best = groups[0][0] if groups and groups[0][0] is not first else None
+    if best is not None and not first.failure and best.cost > (1 - _LOWER) * first.cost:
+        best = None
+    return best, Screening(
         minima=minima,
-        starts={name: np.stack([v[name] for v in values]) for name in problem.names},
+        points={name: np.stack([v[name] for v in values]) for name in problem.names},
         searched=tuple(sorted(members)),
         failures=dict(sorted(failures.items())),
-        unfinished=tuple(k for k in range(starts) if k not in ended and k not in failures),
+        unfinished=tuple(k for k in range(len(points)) if k not in ended and k not in failures),
         iterations=sum(len(m.history) for m in (*members.values(), *further.values()) if not m.failure),
+        remark=remark,
     )
 
 
@@ -256,12 +258,16 @@ def unit_points(count: int, size: int, seed: int) -> Float[np.ndarray, "k n"]:
     return np.clip(sobol.random_base2(exponent)[:count], _EDGE, 1 - _EDGE)
 
 
-def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], ranges: Ranges) -> Float[np.ndarray, "l n"]:
-    """Coordinates of the first guess, and of points of the unit cube, its sides as `ranges` of `fit_multistart` says.
-    The range of a positive parameter is one of its logarithm.
+def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], starts: Starts) -> Float[np.ndarray, "l n"]:
+    """Coordinates of the first guess, of the points of `starts`, and of points of the unit cube, its sides as its
+    `ranges` say. The range of a positive parameter is one of its logarithm.
     """
+    ranges = dict(starts.ranges or {})
     unknown = sorted(set(ranges) - set(problem.names))
     require(not unknown, f"ranges must be of parameters ({', '.join(problem.names)}), got {', '.join(unknown)}.")
+    for number, point in enumerate(starts.points):
+        unknown = sorted(set(point) - set(problem.names))
+        require(not unknown, f"Start {number} must be of {', '.join(problem.names)}, got {', '.join(unknown)}.")
     columns, column = [], 0
     for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
         share = shares[:, column : column + start.size].reshape(-1, *start.shape)
@@ -291,8 +297,12 @@ def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], range
             values = np.exp(np.log(lower) + share * (np.log(upper) - np.log(lower)))
         else:
             values = lower + share * (upper - lower)
+        asked = np.array([np.broadcast_to(np.asarray(p.get(name, first), float), first.shape) for p in starts.points])
+        for value in asked:
+            parameter.check(name, np.asarray(value))
+        values = np.concatenate([asked.reshape(-1, *first.shape), values])
         z = parameter.coordinate(start, jnp.asarray(values, start.dtype))
-        columns.append(np.asarray(z, float).reshape(len(share), -1))
+        columns.append(np.asarray(z, float).reshape(len(values), first.size))
     return np.concatenate([np.zeros((1, problem.size)), np.concatenate(columns, axis=1)])
 
 
@@ -334,12 +344,14 @@ def critical_distance(count: int, size: int) -> float:
     return float(np.exp(logarithm / size) / np.sqrt(np.pi))
 
 
+_AUTOMATIC = 24  # points that are looked at without being asked
+_SHOWN = 8  # how many minima a table shows
 _FAILS = "the simulation fails there, or does not reach the data"
 _JOINED = 0.01  # a search so near to a better one, in each coordinate, would go the same way
 _SETTLED = 1e-2  # a search that lately lowered its sum of squares by less than this part is at a minimum
 _NEAR_BEST = 2.0  # searches that end within this factor of the least sum of squares are searched on
+_LOWER = 1e-3  # a minimum that is lower by less than this part is none better
 _NEAR = 0.02  # ends of searches so near in each coordinate are one minimum
-_SHOWN = 8  # how many minima a table shows
 _EDGE = 1e-3  # shares nearer to 0 and 1 are none: a start at a bound does not move
 _DECADE = 10.0  # how far from the first guess a positive parameter starts, as a factor
 _SIGMA = 2.0  # σ of the critical distance

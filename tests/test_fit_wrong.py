@@ -1,0 +1,167 @@
+"""Fits that are wrong, and say so: false minima, residuals with a shape, grids too coarse, numbers that data cannot
+part."""
+
+import warnings
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_fit import DT, NOISE, RATIO, experiment, tracks
+
+import mpmjax as mpm
+from mpmjax.fitting._misfit import shape_of
+
+E, SIDE = 7e4, 0.4
+
+
+def block(n=1):
+    """A free square that is stretched as it starts and vibrates, of 4n cells."""
+    grid = mpm.Grid((8 * n, 8 * n), 0.1 / n, origin=(-2 * n, -2 * n))
+    q = mpm.fill(mpm.Box((0.0, 0.0), (SIDE, SIDE)), grid, particles_per_cell=4, density=1e3)
+    q = eqx.tree_at(lambda q: q.v, q, jnp.asarray([0.3, -0.2]) * jnp.sin(np.pi * (q.x / SIDE - 0.5)))
+    return mpm.Scene(grid, mpm.NeoHookean(E, 0.3)), q
+
+
+def spread(scene, q):
+    """Root mean square of the places along each axis."""
+    return jnp.sqrt(((q.x - q.x.mean(axis=0)) ** 2).mean(axis=0))
+
+
+def motion(n, steps):
+    """Times and spreads of the block on 4n cells."""
+    scene, q = block(n)
+    run = mpm.simulate(scene, q, t1=steps * DT, dt=DT / n, save_every=n, observe=spread)
+    return np.asarray(run.times)[1:], np.asarray(run.observed)[1:]
+
+
+def swing(times, values, n=1, sigma=NOISE):
+    scene, q = block(n)
+    t1 = float(np.round(times[-1] / DT)) * DT
+    return mpm.Experiment(scene, q, t1=t1, dt=DT / n, observations=mpm.Series(times, values, spread, sigma=sigma))
+
+
+@pytest.fixture(scope="module")
+def both_grids():
+    """Five periods of the block on four cells, and on sixteen."""
+    return {n: motion(n, 80) for n in (1, 4)}
+
+
+def stiffness(start):
+    return {"E": mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=start, unit="Pa")}
+
+
+def test_other_starts_are_tried_where_the_misfit_is_beyond_the_noise(both_grids):
+    """E of a vibration of five periods, from twice the truth: a single search ends at a false minimum, and says that
+    its misfit is no noise; others are tried until one is, and the table says so. A fit that is right tries none."""
+    times, exact = both_grids[1]
+    seen = swing(times, exact + NOISE * np.random.default_rng(0).normal(size=exact.shape))
+    with pytest.warns(UserWarning, match="times the noise given"):
+        alone = mpm.fit(seen, stiffness(1.5e5), starts=1)
+    assert alone.is_beyond
+    assert alone["E"].value > 1.3e5
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = mpm.fit(seen, stiffness(1.5e5))
+    assert abs(found["E"].value - E) < 4 * found["E"].error
+    assert not found.is_beyond
+    assert found.screening.minima[0].values["E"] == pytest.approx(found["E"].value, rel=1e-2)
+    assert found.screening.minima[-1].values["E"] == pytest.approx(alone["E"].value, rel=1e-2)
+    assert "24 points, " in str(found)
+    assert len(found.screening.searched) < 8
+    right = mpm.fit(seen, stiffness(6e4))
+    assert right.screening is None
+    assert "points, " not in str(right)
+
+
+def autoregressive(rng, count, phi):
+    """Noise of variance one with a correlation φ of neighbours."""
+    noise = [rng.normal()]
+    for _ in range(count - 1):
+        noise.append(phi * noise[-1] + np.sqrt(1 - phi**2) * rng.normal())
+    return np.array(noise)
+
+
+def test_residuals_that_are_no_noise_are_named(both_grids):
+    """A sensor that drifts, and noise that is correlated: the table names them, and what they do to the error, which
+    the first interval has, whether σ is given or estimated. White noise is called nothing."""
+    times, exact = both_grids[1]
+    rng = np.random.default_rng(0)
+    drift = 5 * NOISE * np.linspace(0, 1, 80)[:, None]
+    correlated = NOISE * np.stack([autoregressive(rng, 80, 0.8) for _ in range(2)], axis=1)
+    white = NOISE * rng.normal(size=exact.shape)
+    for shape, noise in {"a ramp": drift + white, "correlated": correlated, "": white}.items():
+        for sigma in (None, NOISE):
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                found = mpm.fit(swing(times, exact + noise, sigma=sigma), stiffness(6e4), starts=1)
+            (seen,), stiff, table = found.noise, found["E"], str(found)
+            assert seen.shape == shape
+            texts = [str(w.message) for w in caught]
+            assert any("residuals of 'series'" in text for text in texts) == bool(shape)
+            assert ("by noise alone" in table) == bool(shape)
+            assert stiff.interval[0] < E < stiff.interval[1]
+            wider = np.sqrt(160 / seen.worth) * (seen.misfit if seen.is_beyond else min(seen.misfit, 1))
+            assert stiff.error == pytest.approx((wider if shape else 1) * stiff.noise_error, rel=0.01)
+            assert f"{seen.worth:.2g} independent numbers" in table or not shape
+            assert seen.is_beyond == (bool(shape) if sigma is None else shape == "a ramp")
+
+
+def test_correlated_numbers_are_worth_what_theory_says():
+    """N (1 − φ)/(1 + φ) of noise whose neighbours have the correlation φ; all of white noise; those of one sequence
+    where many are the same."""
+    rng = np.random.default_rng(1)
+    for phi in (0.5, 0.8):
+        each = [shape_of(autoregressive(rng, 400, phi)).factor for _ in range(60)]
+        assert np.median(each) == pytest.approx((1 + phi) / (1 - phi), rel=0.2)
+    white = [shape_of(rng.normal(size=(40, 20))) for _ in range(200)]
+    assert sum(shape.kind != "" for shape in white) < 5
+    common = rng.normal(size=(40, 1)) + 0.1 * rng.normal(size=(40, 20))
+    assert shape_of(common).factor == pytest.approx(20, rel=0.2)
+
+
+@pytest.mark.parametrize("steps", [20, 80])
+def test_the_first_interval_holds_what_the_grid_gets_wrong(both_grids, steps):
+    """Of data made on a grid four times finer: that of the noise alone is many times too narrow."""
+    times, fine = both_grids[4]
+    data = fine + NOISE * np.random.default_rng(1).normal(size=fine.shape)
+    with pytest.warns(UserWarning, match="times the noise given"):
+        found = mpm.fit(swing(times[:steps], data[:steps]), stiffness(6e4), starts=1)["E"]
+    assert found.interval[0] < E < found.interval[1]
+    assert abs(found.value - E) > 4 * found.noise_error
+    assert found.interval[1] - found.interval[0] < 15 * abs(found.value - E)
+
+
+def test_a_fit_on_finer_grids_starts_from_all_minima_and_says_what_its_misfit_is(both_grids):
+    """From twice the truth the coarse grid has several minima, from each of which the finer one starts. Its misfit
+    falls with the spacing; one of a sensor that drifts does not."""
+    times, fine = both_grids[4]
+    white = NOISE * np.random.default_rng(1).normal(size=fine.shape)
+    for drift, says in ((0.0, "falls with the spacing"), (0.02, "does not fall with the spacing")):
+        data, starts = fine + white + drift * np.linspace(0, 1, 80)[:, None], 1 if drift else "auto"
+        guess = stiffness(6e4 if drift else 1.5e5)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            found = mpm.fitting.fit_refined(lambda n, y=data: swing(times, y, n), guess, order=2, starts=starts)
+        assert says in str(found)
+        assert any(says in str(w.message) for w in caught)
+        if drift == 0:
+            (coarse, finer), last = found.fits, found["E"]
+            assert len(coarse.screening.minima) > 1
+            assert {round(float(m.values["E"])) for m in coarse.screening.minima} <= {
+                round(float(value)) for value in finer.screening.points["E"]
+            }
+            assert last.interval[0] < E < last.interval[1]
+
+
+def test_two_numbers_that_cannot_be_parted_are_named_after_the_first_jacobian():
+    """E and ν of a bar in one dimension, whose motion sees one modulus: before the first iteration, and once."""
+    times, x, which = tracks()
+    lines, guess = [], stiffness(1e5) | {"nu": RATIO}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mpm.fit(experiment(mpm.Tracks(times, x, which=which, sigma=NOISE)), guess, progress=lines.append)
+    (named,) = (k for k, line in enumerate(lines) if line.startswith("at the first guess, E and nu: "))
+    (first,) = (k for k, line in enumerate(lines) if line.startswith("   0  misfit"))
+    assert named < first
+    assert sum("E and nu: " in str(w.message) for w in caught) == 1
