@@ -45,7 +45,7 @@ def vibration() -> None:
         )
         print(
             f"vibration from {100 * share:.0f} Pa: fit {alone['E'].value:.4g} Pa; staged {staged['E'].value:.6g} Pa, "
-            f"first until {staged.stages[0].horizon / exact.duration:.2f} periods, {len(staged.stages) + 1} stages",
+            f"{len(staged.remarks)} stages: {staged.remarks[0]}",
             flush=True,
         )
 
@@ -81,7 +81,7 @@ def windows() -> None:
     parts = [window(k, k + WINDOW_FRAMES, state(k)) for k in range(1, end, WINDOW_FRAMES)]
     for share in (0.57, 0.3):
         told("all data", share, mpm.fit(whole, modulus(100 * share), starts=1))
-        told("staged", share, mpm.fitting.fit_staged(whole, modulus(100 * share)).result)
+        told("staged", share, mpm.fitting.fit_staged(whole, modulus(100 * share)))
         told(f"{len(parts)} windows of a period", share, mpm.fit(parts, modulus(100 * share), starts=1))
 
 

@@ -471,7 +471,7 @@ BAD_DATA = {
     "empty": (lambda: mpm.Series([0.02], np.array([np.nan]), mpm.fitting.Extent(0)), "has no data"),
     "infinite": (lambda: mpm.Series([0.02], np.array([np.inf]), mpm.fitting.Extent(0)), "finite data"),
     "no noise": (lambda: mpm.Series([0.02], ones(1), mpm.fitting.Extent(0), sigma=0.0), "greater than zero"),
-    "shape": (lambda: mpm.Series([0.01, 0.02], ones(3), mpm.fitting.Extent(0)), "values of shape"),
+    "shape": (lambda: mpm.Series([0.01, 0.02], ones(3), mpm.fitting.Extent(0)), "data of shape"),
     "markers": (lambda: mpm.Tracks([0.01], ones((1, 2, 1)), which=[0]), "of the m markers"),
     "no particle": (lambda: mpm.Tracks([0.01], ones((1, 1, 1)), which=[99]), "from 0"),
     "dimension": (lambda: mpm.Tracks([0.01], ones((1, 1, 3)), which=[0]), "3-dimensional"),

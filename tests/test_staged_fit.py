@@ -37,15 +37,15 @@ def test_a_vibration_is_found_from_far_off(share):
     """From −43 % and −70 %, where a fit to all data ends at half of E; what is left is the grid's error."""
     whole = vibration()
     with pytest.warns(UserWarning, match="did not converge"):
-        alone = mpm.fit(whole, from_part(share))
+        alone = mpm.fit(whole, from_part(share), starts=1)
     assert alone["E"].value < 60
     found = mpm.fitting.fit_staged(whole, from_part(share))
     assert found["E"].value == pytest.approx(100, rel=2e-3)
-    horizons = [stage.horizon for stage in found.stages]
+    horizons = [float(text.split()[1]) for text in found.remarks if text.startswith("until ")]
     assert 0.3 * EXACT.duration < horizons[0] < 1.5 * EXACT.duration
-    assert np.allclose(np.diff(np.log2(horizons)), 1)
-    assert found.horizons == (pytest.approx(PERIODS * EXACT.duration),)
-    assert "until [s]" in str(found)
+    assert np.allclose(np.diff(np.log2(horizons)), 1, atol=1e-2)
+    assert found.experiments[0].t1 == pytest.approx(PERIODS * EXACT.duration)
+    assert f"until {horizons[0]:.4g} s" in str(found)
 
 
 def test_an_experiment_until_a_time_ends_there():

@@ -199,13 +199,13 @@ def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> Fit
     print(staged)
 
     def until(experiments: tuple[Experiment, ...]) -> tuple[Experiment, ...]:
-        return tuple(e.until(end) for e, end in zip(experiments, staged.horizons, strict=True))
+        return tuple(e.until(fitted.t1) for e, fitted in zip(experiments, staged.experiments, strict=True))
 
     def refined(n: int) -> tuple[tuple[Experiment, ...], tuple[Experiment, ...]]:
         fitted, whole = asked.refined(n)
         return until(fitted), whole
 
-    parameters = staged.result.restarted(asked.parameters)
+    parameters = staged.restarted(asked.parameters)
     return asked._replace(parameters=parameters, experiments=until(asked.experiments), refined=refined)
 
 

@@ -56,8 +56,6 @@ from mpmjax.fitting._result import (
 from mpmjax.fitting._search import AbstractOptimiser as AbstractOptimiser, Evaluation as Evaluation
 from mpmjax.fitting._sequence import (
     RefinedFit as RefinedFit,
-    Stage as Stage,
-    StagedFit as StagedFit,
     fit_refined as fit_refined,
     fit_staged as fit_staged,
 )

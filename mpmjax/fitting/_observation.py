@@ -16,48 +16,37 @@ from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene
 
 
-class Curve(AbstractObservation):
+class _Measured(AbstractObservation):
+    """A measurement whose noise and weight are as `Series` says."""
+
+    sigma: Float[np.ndarray, "..."] | None = eqx.field(converter=as_floats, default=None, kw_only=True)
+    weight: Scalar = eqx.field(converter=as_floats, default=1.0, kw_only=True)
+    robust: Scalar | None = eqx.field(converter=as_floats, default=None, kw_only=True)
+
+
+class Curve(_Measured):
     """A quantity measured against another one: stress against stretch, a force against a displacement.
 
     Args:
         x: measured abscissae, shape (m,).
-        y: measured ordinates, shape (m,).
+        data: measured ordinates y, shape (m,).
         of: function of (scene, particles) that returns one point (x, y) of the simulated curve; x must grow in time.
         sigma: standard deviation of the noise of y; None to estimate it.
         weight, robust, name: see `Series`.
         x_name: what pictures call the abscissa.
     """
 
-    x: Float[np.ndarray, "m"]
-    data: Float[np.ndarray, "m"]
+    x: Float[np.ndarray, "m"] = eqx.field(converter=as_floats)
+    data: Float[np.ndarray, "m"] = eqx.field(converter=as_floats)
     of: Callable[[Scene, Particles], Any]
-    sigma: Float[np.ndarray, "..."] | None
-    weight: Scalar
-    robust: Scalar | None
-    name: str = eqx.field(static=True)
-    x_name: str = eqx.field(static=True)
-
-    def __init__(
-        self,
-        x: Numbers,
-        y: Numbers,
-        of: Callable[[Scene, Particles], Any],
-        *,
-        sigma: Numbers | None = None,
-        weight: Scalar = 1.0,
-        robust: Scalar | None = None,
-        name: str = "curve",
-        x_name: str = "abscissa",
-    ):
-        self.x, self.data, self.of, self.name = as_floats(x), as_floats(y), of, name
-        self.sigma, self.weight, self.robust = map(as_floats, (sigma, weight, robust))
-        self.x_name = x_name
+    name: str = eqx.field(static=True, default="curve", kw_only=True)
+    x_name: str = eqx.field(static=True, default="abscissa", kw_only=True)
 
     def __check_init__(self):
         require_fields(self)
         require(
             self.x.ndim == 1 and self.x.shape == self.data.shape,
-            f"{self.title} needs x and y of one shape (m,), got {self.x.shape} and {self.data.shape}.",
+            f"{self.title} needs x and data of one shape (m,), got {self.x.shape} and {self.data.shape}.",
         )
         require_finite(f"The abscissae of {self.title}", self.x)
 
@@ -96,49 +85,32 @@ class Curve(AbstractObservation):
         return (measured < x[0] - slack) | (measured > x[-1] + slack)
 
 
-class Series(AbstractObservation):
+class Series(_Measured):
     """A quantity measured against time: a height, a front, an energy, an image, anything that a state says.
 
     Between steps it is interpolated linearly.
 
     Args:
         times: when it was measured [s], shape (f,), growing, from 0 to the experiment's t1.
-        values: what was measured, shape (f, ...); NaN or masked where nothing was.
+        data: what was measured, shape (f, ...); NaN or masked where nothing was.
         of: function of (scene, particles) that returns it, shape (...).
-        sigma: standard deviation of the noise, in the unit of the values; None to estimate it.
+        sigma: standard deviation of the noise, in the unit of the data; None to estimate it.
         weight: factor of the squares.
         robust: misfit in standard deviations beyond which squares grow but linearly.
         name: what tables and pictures call it.
     """
 
-    times: Float[np.ndarray, "f"]
-    data: Float[np.ndarray, "f ..."]
+    times: Float[np.ndarray, "f"] = eqx.field(converter=as_floats)
+    data: Float[np.ndarray, "f ..."] = eqx.field(converter=as_floats)
     of: Callable[[Scene, Particles], Any]
-    sigma: Float[np.ndarray, "..."] | None
-    weight: Scalar
-    robust: Scalar | None
-    name: str = eqx.field(static=True)
-
-    def __init__(
-        self,
-        times: Numbers,
-        values: Numbers,
-        of: Callable[[Scene, Particles], Any],
-        *,
-        sigma: Numbers | None = None,
-        weight: Scalar = 1.0,
-        robust: Scalar | None = None,
-        name: str = "series",
-    ):
-        self.times, self.data, self.of, self.name = as_floats(times), as_floats(values), of, name
-        self.sigma, self.weight, self.robust = map(as_floats, (sigma, weight, robust))
+    name: str = eqx.field(static=True, default="series", kw_only=True)
 
     def __check_init__(self):
         require_fields(self)
         what = self.title
         require(
             self.data.shape[:1] == self.times.shape,
-            f"{what} needs times of shape (f,) and values of shape (f, ...), got {self.times.shape} and "
+            f"{what} needs times of shape (f,) and data of shape (f, ...), got {self.times.shape} and "
             f"{self.data.shape}.",
         )
         require_finite(f"The times of {what} [s]", self.times)
@@ -168,7 +140,7 @@ class Series(AbstractObservation):
         shape = getattr(seen, "shape", None)
         require(
             shape == self.data.shape[1:],
-            f"{self.title} has values of shape {self.data.shape[1:]} at each time, but of "
+            f"{self.title} has data of shape {self.data.shape[1:]} at each time, but of "
             f"returns {'no array' if shape is None else f'shape {shape}'}.",
         )
 

@@ -333,17 +333,6 @@ def table(head: Sequence[str], *rows: Sequence[str]) -> list[str]:
     return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]
 
 
-def table_of_minima(
-    head: Sequence[str], cells: Sequence[Sequence[str]], minima: Any, labels: Sequence[str]
-) -> list[str]:
-    """The lines of a table of minima: cells of each, its misfit, and the first fitted numbers."""
-    rows = []
-    for these, minimum in zip(cells, minima, strict=True):
-        numbers = np.concatenate([value.reshape(-1) for value in minimum.values.values()])
-        rows.append((*these, f"{minimum.misfit:>10.4g}", *(f"{number:>13.6g}" for number in numbers[:SHOWN])))
-    return table((*head, f"{'misfit/σ':>10}", *(f"{label:>13}" for label in labels[:SHOWN])), *rows)
-
-
 SHOWN = 4  # parameters that a line has room for
 ROW_COST = 1.2
 """Cost of a row of the Jacobian by reverse mode, over that of a column by forward mode (benchmarks/fit_cost.py)."""

@@ -102,6 +102,7 @@ class FitResult(AbstractFit):
     """Directions that the data do not see, and a misfit that the noise does not explain, in words."""
     interrupted: bool = False  # whether Ctrl-C ended it
     screening: Screening | None = None  # the other points from which the minimum was searched, if it was
+    remarks: tuple[str, ...] = ()  # how its start was come by, in words
 
     @property
     def values(self) -> dict[str, np.ndarray]:
@@ -211,7 +212,8 @@ class FitResult(AbstractFit):
             ("", f"{'numbers':>12}", "noise σ", "misfit/σ", "residuals"[: 9 * any(n[-1] for n in noises)]), *noises
         )
         looked = [] if self.screening is None else ["", str(self.screening)]
-        return "\n".join([first, *many, *body, "", *noise, "", chi, who, *lost, *self.warnings, *looked])
+        before = [*self.remarks, ""] if self.remarks else []
+        return "\n".join([*before, first, *many, *body, "", *noise, "", chi, who, *lost, *self.warnings, *looked])
 
 
 def restarted(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,39 +19,11 @@ from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import chosen_optimiser, fit, require_derivative
 from mpmjax.fitting._observation import Series
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem, table, table_of_minima
+from mpmjax.fitting._problem import Coordinates, FitProblem, table
 from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, NoiseEstimate, restarted
 from mpmjax.fitting._search import AbstractOptimiser, begin, iterate, jacobian, search
 from mpmjax.fitting._starts import Starts, as_starts
 from mpmjax.fitting._uncertainty import quantile
-
-
-class Stage(NamedTuple):
-    """A search with the data until one time."""
-
-    horizon: float  # the time [s]
-    values: dict[str, np.ndarray]  # the value of each parameter at its minimum, in its shape
-    misfit: float  # root mean square of the residuals, in units of σ, or of the size of the data where σ is not given
-    iterations: int
-
-
-class StagedFit(AbstractFit):
-    """A fit that came about in stages; `result["E"]` is the estimate of a parameter by the last stage."""
-
-    stages: tuple[Stage, ...]  # the searches before the last, with growing horizons
-    result: FitResult  # the last fit, with its errors
-    horizons: tuple[float, ...]  # until when the data of each experiment were used in the last fit [s]
-    remarks: tuple[str, ...]  # how the horizons were chosen, in words
-
-    @property
-    def all(self) -> tuple[Estimate, ...]:
-        return self.result.all
-
-    def __str__(self) -> str:
-        """The remarks, a table of the stages, then that of the last fit."""
-        cells = [(f"{s.horizon:>24.4g}",) for s in self.stages]
-        rows = table_of_minima((f"{'until [s]':>24}",), cells, self.stages, self.result.problem.labels)
-        return "\n".join([*self.remarks, "", *rows, "", str(self.result)])
 
 
 @checked
@@ -65,13 +37,13 @@ def fit_staged(
     level: Scalar = 0.95,
     optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
-) -> StagedFit:
+) -> FitResult:
     """Fit to the data until a first time, then until later ones, each from where the last search ended.
 
     For motions that repeat or that contacts decide, of which a fit to all data ends in a false minimum.
 
         result = mpm.fitting.fit_staged(swing, {"E": ...})
-        print(result)  # how the horizons were chosen, the stages, the estimate
+        print(result)  # how the horizons were chosen, the stages (`result.remarks`), the estimate
 
     *The first horizon*, where `horizons` does not give it, is the last time until which a change of one in any
     coordinate changes the data by no more than they change themselves, √Σ (∂y/∂z)² ≤ √Σ (y − y(0))², by the derivative
@@ -123,7 +95,6 @@ def fit_staged(
             else "One stage suffices: until the end of the data a change of one in a coordinate changes them by no "
             "more than they change themselves, or by as much at all times."
         )
-    stages: list[Stage] = []
     for horizon in times:
         cut = _cut(problem, limits, horizon)
         if [e.steps for e in cut.experiments] == [e.steps for e in _cut(problem, limits, end).experiments]:
@@ -135,8 +106,7 @@ def fit_staged(
         if minimum.failure:
             cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
         z, misfit, count = minimum.z, cut.misfit(minimum.cost), len(minimum.history)
-        stages.append(Stage(horizon, problem.by_name(z), misfit, count))
-        say(f"until {horizon:.4g} s: misfit/σ {misfit:.4g}, {problem.shown(z)}, {count} iterations")
+        tell(f"until {horizon:.4g} s: misfit/σ {misfit:.4g}, {problem.shown(z)}, {count} iterations")
         limits = _limits(problem.at(z), float(growth))
     cut = _cut(problem, limits, end)
     for k, (whole, used, limit) in enumerate(zip(problem.experiments, cut.experiments, limits, strict=True)):
@@ -150,7 +120,7 @@ def fit_staged(
             warn(remarks[-1])
     start = restarted(parameters, problem.by_name(z))
     result = fit(cut.experiments, start, report=report, level=level, optimiser=optimiser, progress=progress)
-    return StagedFit(tuple(stages), result, tuple(e.t1 for e in cut.experiments), tuple(remarks))
+    return replace(result, remarks=tuple(remarks))
 
 
 def _cut(problem: FitProblem, limits: Sequence[float], horizon: float) -> FitProblem:

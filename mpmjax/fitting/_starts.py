@@ -13,7 +13,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Int, Scalar
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_whole
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas, table_of_minima
+from mpmjax.fitting._problem import SHOWN, Coordinates, FitProblem, Sigmas, table
 from mpmjax.fitting._search import AbstractOptimiser, Search, batch_size, counted, search_many
 
 Ends = list[tuple[Search, list[int]]]  # minima, with the numbers of the points that led there
@@ -105,10 +105,18 @@ class Screening(eqx.Module):
     def __str__(self) -> str:
         """A table of the minima."""
         minima, count = self.minima[:_SHOWN], len(next(iter(self.points.values())))
-        labels = [name if v.ndim == 1 else f"{name}[…]" for name, v in self.points.items()]
-        cells = [(f"{len(m.members):>24}", f"{m.searches:>8}") for m in minima]
-        rows = table_of_minima((f"{'points':>24}", "searches"), cells, minima, labels)
-        lines = [f"{count} points, {len(self.searched)} searches, {self.iterations} iterations", *rows]
+        rows = [
+            (
+                f"{len(m.members):>24}",
+                f"{m.searches:>8}",
+                f"{m.misfit:>10.4g}",
+                *(f"{value.reshape(-1)[0]:>13.6g}" for value in list(m.values.values())[:SHOWN]),
+            )
+            for m in minima
+        ]
+        labels = [f"{name if v.ndim == 1 else f'{name}, first':>13}" for name, v in self.points.items()][:SHOWN]
+        lines = [f"{count} points, {len(self.searched)} searches, {self.iterations} iterations"]
+        lines += table((f"{'points':>24}", "searches", f"{'misfit/σ':>10}", *labels), *rows)
         if len(self.minima) > _SHOWN:
             lines.append(f"and {len(self.minima) - _SHOWN} minima with a larger misfit.")
         if self.unfinished:
