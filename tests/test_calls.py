@@ -22,8 +22,8 @@ def test_bad_arguments_end_in_value_errors(tmp_path):
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
-MADE_BY_THE_PACKAGE = """Bootstrap EnsembleFit FitResult MultistartFit Prediction
-Profile RefinedFit Run StagedFit Markers StressStretch"""
+MADE_BY_THE_PACKAGE = """Bootstrap EnsembleFit FitResult Prediction
+Profile RefinedFit Run Screening Markers StressStretch"""
 """Classes of what the package returns, or what a step is made of."""
 WITHOUT_ARGUMENTS = "CentreOfMass backend"
 BY_THEMSELVES = "register read_columns FitProblem Columns after read_arrays"

@@ -66,15 +66,23 @@ def fit(
     observation gives no σ, it is estimated: as √(Σ r²/(m − n)) of one observation, and of several so that each
     explains its own misfit, in rounds.
 
-    Errors are those of the Gauss-Newton Hessian (JᵀJ)⁻¹: what the noise of the data, independent and normal, does to
-    the parameters. They say nothing of what the law or the discretisation gets wrong, which often is more: fit on two
-    spacings and compare.
+    The misfit is held against the noise, and residuals of each observation against independent ones, in their order:
+    where there is more than that, other starts are tried (`starts`), the table says what shape residuals have, and
+    errors and intervals hold it. Of the noise alone they are those of the Gauss-Newton Hessian, (JᵀJ)⁻¹, and stand
+    beside them. The covariance is (JᵀJ)⁻¹ Σ c_k J_kᵀJ_k (JᵀJ)⁻¹, c_k being the product of χ²/ν of observation k, where
+    its noise was given and that is improbable (R. T. Birge, Phys. Rev. 40 (1932) 207, doi 10.1103/PhysRev.40.207), and
+    of its numbers over the independent ones that they are worth, N/N' (see `NoiseEstimate.worth`); with Student's
+    quantile of ν N'/N, or four, degrees of freedom. None of it sees what a parameter can make up for: fit on two
+    spacings (`fit_refined`). What the data do not see, or not apart, is named after the first Jacobian.
 
     Ctrl-C ends a fit after the iteration in progress, and it returns the best that it has, not converged.
 
     Args:
         experiments: one or several, which share the parameters.
         parameters: what is fitted, by name.
+        starts: from how many points it is searched, or which (`Starts`). "auto": where the misfit of the first search
+            is beyond the noise, 24 more points are looked at, a simulation each, and some searched from, until a misfit
+            is within it; `result.screening` has what they found. 1 searches from the first guess alone.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
         optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, with few
@@ -82,7 +90,7 @@ def fit(
         memory: for what reverse mode stores, and for the tangents of forward mode that are made at once [B].
         progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`.
         log: an HDF5 file that is to hold each iteration (docs/fitting.md). Whatever ends the fit, the file is whole and
-            lacks at most the iteration in progress.
+            lacks at most the iteration in progress. It holds the first search, and the last one from another start.
         resume: continue the fit of the log, bit for bit. Only the optimiser's `max_steps` may differ.
 
     Raises:
@@ -346,7 +354,7 @@ def fit_ensemble(
         experiments: the data sets: an experiment each, or several experiments each that share the parameters. They may
             differ in every number (data, noise, places, velocities, materials), and in no shape, choice or function:
             give a marker that was not seen as NaN.
-        batch: how many searches run together, see `fit_multistart`.
+        batch: how many searches run together, see `Starts`.
         progress: called with a line, such as `print`, as searches end.
         parameters, report, level, optimiser: see `fit`.
 

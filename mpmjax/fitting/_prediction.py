@@ -250,7 +250,7 @@ def bootstrap(
         result: the fit.
         repeats: how many fits.
         seed: of the noise.
-        batch: how many fits run together, see `fit_multistart`.
+        batch: how many fits run together, see `Starts`.
         optimiser: the method of each. Default: that of the fit.
         progress: called with a line, such as `print`, as fits end.
 

@@ -32,7 +32,7 @@ class Profile(eqx.Module):
     symmetric: tuple[float, float]  # the interval of the standard error
     interval: tuple[float, float]
     """Where Δχ² is below the threshold. An end that was not found is the parameter's bound, or infinite."""
-    threshold: float  # Δχ² at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν)
+    threshold: float  # Δχ² at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν), or more
     degrees_of_freedom: float  # ν of the noise's estimate; infinite where it was given
     level: float  # the level of the interval [-], such as 0.95
     warnings: tuple[str, ...]  # where it ends without an end of the interval, in words
@@ -92,7 +92,8 @@ def profile(
     threshold is never reached the interval is open, and where Δχ² jumps over it, as a simulation does beyond its stable
     step, it ends there: a warning says so. One program is compiled for all points, and for all numbers of a fit.
 
-    The noise is held at what the fit found. With a robust or weighted observation the threshold is approximate.
+    The noise is held at what the fit found. Where the fit's misfit is beyond it, the threshold is larger by the square
+    of what errors are (see `fit`). With a robust or weighted observation it is approximate.
 
     Args:
         result: the fit.
@@ -113,8 +114,11 @@ def profile(
     require_positive("profile's rtol", rtol)
     at, optimiser = problem.labels.index(label), result.optimiser if optimiser is None else optimiser
     unit, errors = np.eye(problem.size)[at], result.uncertainty
-    freedom, error = float(errors.of(unit)[1]), float(errors.error[at])
-    reach = float(quantile(level, freedom))
+    # By the noise alone √Δχ² is one at a standard error; the threshold is as much farther as the misfit widens that.
+    wider = result.estimates[at].error / result.estimates[at].noise_error
+    wider = wider if np.isfinite(wider) else 1.0
+    freedom, error = float(errors.of(unit)[1]), float(errors.error[at]) / wider
+    reach = float(quantile(level, freedom)) * wider
 
     def numbers(z: np.ndarray) -> np.ndarray:
         """All fitted numbers at coordinates."""
@@ -242,7 +246,7 @@ def profile(
         warn(text)
     path = sorted(visited, key=lambda point: point[0][at])
     along_path, values = np.stack([numbers(z) for z, _ in path]), [value(place) for place, *_ in ends]
-    symmetric = intervals(problem, jnp.asarray(result.z), errors, result.gradient, level)
+    symmetric = intervals(problem, jnp.asarray(result.z), errors, result.gradient / wider**2, level)
     return Profile(
         label=label,
         unit=result.estimates[at].unit,

@@ -54,7 +54,7 @@ class NoiseEstimate(NamedTuple):
     estimated: bool  # whether the fit estimated it
     misfit: float  # root mean square of the residuals, in units of σ
     points: int  # how many numbers were measured
-    worth: float  # how many independent numbers they are worth, by their residuals
+    worth: float  # how many independent numbers they are worth, by the correlation of their residuals
     shape: str  # the shape of the residuals, "a ramp", "drifts" or "correlated"; empty where they have none
     is_beyond: bool  # whether the misfit is beyond the noise: by χ² where that is given, by the shape where it is not
 
