@@ -117,6 +117,15 @@ FITTING = {
     mpm.Curve: TRUST | {"x": [0.1, 0.2], "data": [1.0, 2.0], "of": reached},
     mpm.fitting.Force: TRUST | {"times": [0.1], "forces": [[1.0, 2.0]]},
     mpm.fitting.Torque: TRUST | {"times": [0.1], "forces": [[1.0]]},
+    mpm.fitting.Starts: {
+        "count": 8,
+        "fraction": 0.5,
+        "ranges": {},
+        "points": (),
+        "if_needed": True,
+        "seed": 0,
+        "batch": 1,
+    },
     mpm.fitting.Extent: {"axis": 0},
     mpm.fitting.Density: {"grid": SCENE.grid},
 }
@@ -231,13 +240,13 @@ def given(call: Callable, arguments: dict) -> object:
     return call(*[arguments[name] for name in several], **{k: v for k, v in arguments.items() if k not in several})
 
 
-NONE = ("boundary", "loads", "also", "deformations", "histories", "methods", "refinements")
+NONE = ("boundary", "loads", "also", "deformations", "histories", "methods", "refinements", "points")
 WHERE_USED = ("start", "only", "mean", "sigma")
 TAKEN = {
     *((name, "empty") for name in (*NONE, *WHERE_USED)),
     *((name, "class") for name in ("where", "of")),
     *((name, "nonsense") for name in ("name", "x_name", "unit")),
-    *((name, "masked") for name in ("values", "y")),
+    *((name, "masked") for name in ("data",)),
     ("fitted", "array of words"),
 }
 """What may be none of, or is refused with the parameter's shape; what can be called; what is a word; what may be

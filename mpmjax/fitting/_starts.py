@@ -1,7 +1,7 @@
 """Searches from many starting points, and the minima that they lead to."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -61,8 +61,8 @@ class Starts(eqx.Module):
 
     count: int = 64
     fraction: Scalar = 0.375
-    ranges: Mapping[str, tuple[float, float]] | None = eqx.field(default=None, kw_only=True)
-    points: tuple[Mapping[str, Any], ...] = eqx.field(default=(), kw_only=True)
+    ranges: dict[str, tuple[float, float]] | None = eqx.field(default=None, kw_only=True)
+    points: tuple[dict[str, Any], ...] = eqx.field(default=(), kw_only=True)
     if_needed: bool = eqx.field(default=False, kw_only=True)
     seed: int = eqx.field(default=0, kw_only=True)
     batch: int | None = eqx.field(default=None, kw_only=True)
@@ -72,6 +72,8 @@ class Starts(eqx.Module):
         require_whole("starts", self.count, 1)
         require_between("fraction", self.fraction, 0, 1)
         require_whole("seed", self.seed, 0)
+        if self.batch is not None:
+            require_whole("batch", self.batch, 1)
 
 
 def as_starts(starts: int | Literal["auto"] | Starts) -> Starts:
