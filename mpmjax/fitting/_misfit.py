@@ -1,14 +1,20 @@
 """Shapes that residuals show where a model misses the data: ramps, drifts and correlation."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, ndtr
 
 IMPROBABLE = 1e-3
 """Probability, of noise alone, below which a misfit is beyond the noise, or residuals have a shape."""
 _LEAST_ROWS = 8  # rows below which nothing is said of their order
 _DRIFT = 6  # independent numbers along a sequence, up to which it drifts
+
+
+def improbable(squares: Any, freedom: float) -> bool:
+    """Whether Σ r² of this many degrees of freedom is beyond noise of variance one."""
+    from scipy.special import chdtrc  # here, since it takes long to import
+
+    return bool(freedom > 0 and chdtrc(freedom, squares) < IMPROBABLE)
 
 
 class Shape(NamedTuple):
@@ -37,7 +43,7 @@ def shape_of(r: np.ndarray) -> Shape:
     left = rows - np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyfit(t, rows, 1)).T
     rest = np.maximum((left**2).sum(axis=0), np.finfo(float).tiny)
     explained, squares = (rows**2).sum() - rest.sum(), (count - 2) * (t @ rows) ** 2 / (t @ t) / rest
-    steep = chdtrc(columns / alike, squares.sum() / alike / max(_correlation(left)[1:])) < IMPROBABLE
+    steep = improbable(squares.sum() / alike / max(_correlation(left)[1:]), columns / alike)
     kind = "correlated" if max(alike, of_means, of_squares) > 1 else ""
     kind = "a ramp" if steep and explained > rest.sum() else "drifts" if of_means > count / _DRIFT else kind
     return Shape(alike * max(of_means, of_squares), kind)
@@ -54,14 +60,14 @@ def _correlation(rows: np.ndarray) -> tuple[float, float, float]:
     participation = (gram**2).sum() / total**2  # tr C²/(tr C)², and 1/f by chance
     alone = ((rows**2).sum(axis=0) ** 2).sum() / total**2  # the same of the diagonal of C
     pairs = columns * (columns - 1) / 2
-    together = columns > 1 and chdtrc(pairs, count * pairs * (participation / alone - 1) / (columns - 1)) < IMPROBABLE
+    together = columns > 1 and improbable(count * pairs * (participation / alone - 1) / (columns - 1), pairs)
     alike = float(columns * np.clip(participation - 1 / count, 1 / columns, 1)) if together else 1.0
     above = (rows > 0).sum(axis=0)
     changes = 2 * above * (count - above) / count
     deviation = np.sqrt(max((changes * (changes - 1) / (count - 1)).sum(), 1.0))
     runs = (changes.sum() - np.count_nonzero(np.diff(rows > 0, axis=0))) / deviation
     # Both are normal of variance one where numbers are independent.
-    if ndtr(-np.array([lags[1] * np.sqrt(count * columns), runs]) / np.sqrt(alike)).min() >= IMPROBABLE:
+    if not improbable(max(lags[1] * np.sqrt(count * columns), runs, 0) ** 2 / alike, 1):
         return alike, 1.0, 1.0
     pair_sums = lags[: count // 2 * 2].reshape(-1, 2).sum(axis=1)
     ends = np.flatnonzero(pair_sums <= 0)

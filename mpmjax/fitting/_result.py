@@ -14,7 +14,7 @@ import numpy as np
 from mpmjax._types import Array
 from mpmjax.checks import require
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._misfit import IMPROBABLE, Shape, shape_of
+from mpmjax.fitting._misfit import IMPROBABLE, Shape, improbable, shape_of
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas, table
 from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
@@ -272,17 +272,17 @@ def fit_result(
         ratio, left = noise(r, J, rows, o.count, *o.trust)
         # What is left of exact data is the search's and rounding's.
         measured = misfit * size > max(_EXACT, _ROUNDINGS * eps) * o.scale() and np.isfinite(ratio)
-        improbable = is_given and o.trust == (1.0, None) and chdtrc(left, (r[rows] ** 2).sum()) < IMPROBABLE
+        missed = is_given and o.trust == (1.0, None) and improbable((r[rows] ** 2).sum(), left)
         x = o.against[1]
         shape = shape_of(r[rows].reshape(len(x), -1)[np.argsort(x)]) if measured else Shape(1.0, "")
         # A misfit that noise explains does not make a correlation larger.
-        wider = o.trust[0] * shape.factor * (ratio if improbable else min(ratio, 1)) ** 2
+        wider = o.trust[0] * shape.factor * (ratio if missed else min(ratio, 1)) ** 2
         if not (measured and wider > 1):
             wider, shape = 1.0, Shape(1.0, "")
         freedom = freedom if not is_given else np.inf
         of_noise.append((rows, 1.0, freedom))
         of_misfit.append((rows, wider, freedom if wider == 1 else max(left / shape.factor, _LEAST_FREEDOM)))
-        beyond = bool(improbable or (shape.kind and not is_given))
+        beyond = missed or bool(shape.kind and not is_given)
         worth = o.count / shape.factor
         noises.append(
             NoiseEstimate(o.name, float(size), not is_given, float(misfit), o.count, worth, shape.kind, beyond)
