@@ -72,7 +72,7 @@ def experiment(scene: str, law: str, times: np.ndarray, data: np.ndarray, sigma:
     q = mpm.fill(mpm.Box((0.0, 0.0), (SIDE, SIDE)), grid, particles_per_cell=4, density=DENSITY)
     q = eqx.tree_at(lambda q: q.v, q, start(scene, q.x))
     bounces = scene == "bounce"
-    floor = (mpm.ContactPlane((0.0, 0.0), (0.0, 1.0)),) if bounces else ()
+    floor = (mpm.ContactPlane(1, 0.0),) if bounces else ()
     gravity = (0.0, -9.81 if bounces else 0.0)
     # The peer's floor acts on its nodes, and so up to a cell of its own early, which the fit is not told.
     of = mpm.Scene(grid, getattr(mpm, law)(E, NU), gravity=gravity, boundary=floor)

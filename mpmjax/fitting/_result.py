@@ -261,8 +261,6 @@ def fit_result(
 ) -> FitResult:
     """The result at a minimum, whose residuals are in units of the noise of its search, with the noise that they
     settled; `report` and `level` as of `fit`."""
-    from scipy.special import chdtrc  # here, since it takes long to import
-
     r, J = np.array(minimum.seen.residuals, float), np.array(minimum.seen.jacobian, float)
     eps, z, noises, of_noise, of_misfit = float(jnp.finfo(problem.dtype).eps), minimum.z, [], [], []
     each = zip(problem.observations, problem.rows, problem.noise_is_given, settled, strict=True)
