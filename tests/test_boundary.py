@@ -1,5 +1,7 @@
 """Boundaries: exact on the nodes they act on, also inside the implicit solves."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -225,7 +227,8 @@ def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():
     columns = [np.broadcast_to(rng.random((1, 6)) < 0.5, (7, 6)), np.broadcast_to(rng.random((7, 1)) < 0.5, (7, 6))]
     window = grid.window(jnp.zeros((1, 2)))
     walls = [wall_image(0, 0.2, 1, grid, window, order=2), wall_image(1, 0.35, -1, grid, window, order=2)]
-    images = Mirror(tuple(w.within(jnp.asarray(h.ravel())) for w, h in zip(walls, columns, strict=True)))
+    held = [jnp.asarray(columns[0][None, :1, :, None]), jnp.asarray(columns[1][None, :, :1, None])]
+    images = Mirror(tuple(dataclasses.replace(w, held=h) for w, h in zip(walls, held, strict=True)))
     basis = jnp.eye(84).reshape(84, 42, 2)
     B, transpose = (np.asarray(jax.vmap(f)(basis)).reshape(84, 84).T for f in (images.unfold, images.fold))
     np.testing.assert_array_equal(B.T, transpose)

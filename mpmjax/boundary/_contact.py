@@ -22,14 +22,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from itertools import groupby, permutations
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._conditions import Conditions, OwnedImpulse
-from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Image, Mirror, scattered
+from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Mirror, WallImage, scattered, with_one_mass
 
 ActiveSet = tuple[Bool[Array, "..."], ...]
 """The places that are held, one mask for each contact."""
@@ -74,8 +74,9 @@ class AbstractNodes(eqx.Module):
         """The mirror images of symmetry planes, and of the columns that are held."""
 
     @abc.abstractmethod
-    def constrained(self: "N", images: Mirror, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "N":
-        """These nodes folded at further mirrors, with the components `fixed` held and further springs."""
+    def constrained(self: "N", images: Mirror, mass: NodeScalar, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "N":
+        """These nodes folded at further mirrors to these masses [kg], shape (n,), with the components `fixed` held and
+        further springs."""
 
     @abc.abstractmethod
     def explicit_velocity(self) -> NodeVector:
@@ -98,13 +99,16 @@ class AbstractContact(eqx.Module):
     - `shape`: (n, d).
     """
 
-    known_at_start: ClassVar[bool] = False
-    """Whether `likely_held` is the active set of a step whose force is that at its start."""
+    def known_at_start(self, nodes: AbstractNodes) -> bool:
+        """Whether `likely_held` is the active set of a step whose force is that at its start. Default: it may not
+        be."""
+        del nodes
+        return False
 
-    @property
-    def mirror_image(self) -> Image | None:
-        """The mirror that stands in the places held; None without one."""
-        return None
+    def images(self, active: Array) -> tuple[WallImage, ...]:
+        """The mirrors that stand in the places held. Default: none."""
+        del active
+        return ()
 
     @abc.abstractmethod
     def gap_velocity(self, held: "ConstrainedNodes", v: NodeVector) -> NodeScalar:
@@ -195,7 +199,10 @@ class AbstractSpringContact(AbstractContact):
     """Δt [s]."""
     share: eqx.AbstractVar[Scalar]
     """θ; 1 where forces are those at the start of the step."""
-    known_at_start: ClassVar[bool] = True
+
+    def known_at_start(self, nodes: AbstractNodes) -> bool:
+        del nodes
+        return True
 
     @property
     @abc.abstractmethod
@@ -350,14 +357,13 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     """The nodes with an active set held; no contact may hold anything of them yet."""
     pairs = list(zip(nodes.contacts, active, strict=True))
-    held = [image.within(mask) for contact, mask in pairs if (image := contact.mirror_image) is not None]
-    images = [image.with_one_mass(nodes.mass, Mirror((*held[:k], *held[k + 1 :]))) for k, image in enumerate(held)]
+    walls = tuple(image for contact, mask in pairs for image in contact.images(mask))
     fixed = nodes.conditions.fixed
+    images, mass = with_one_mass(walls, nodes.mass, fixed.shape[1])
     for contact, mask in pairs:
         fixed = fixed | contact.fixed(mask, fixed.shape)
     springs = tuple(term for contact, mask in pairs if (term := contact.springs(mask)) is not None)
-    images = Mirror(tuple(images))
-    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, springs))
+    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, mass, fixed, springs))
 
 
 def count_places(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:

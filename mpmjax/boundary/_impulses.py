@@ -21,7 +21,7 @@ from mpmjax.boundary._boundary import AbstractBoundary
 from mpmjax.boundary._conditions import OwnedImpulse
 from mpmjax.geometry import moment
 from mpmjax.linalg import pairs
-from mpmjax.potential import Image, Mirror, Tie
+from mpmjax.potential import Image, Mirror, Tie, WallImage
 
 
 class Impulses(eqx.Module):
@@ -106,7 +106,7 @@ def owners_of(
 
 
 def taken_by_mirrors(
-    field: NodeVector, images: list[tuple[int, Image]] | list[tuple[int, Image | Tie]]
+    field: NodeVector, images: list[tuple[int, WallImage]] | list[tuple[int, Image | Tie]]
 ) -> tuple[list[OwnedImpulse], NodeVector]:
     """The part of impulses on all nodes [kg m/s], shape (n, d), that mirrors take, and the impulses that remain on true
     nodes. The mirrors come in the order in which they unfold, with their boundaries' numbers.
@@ -115,7 +115,7 @@ def taken_by_mirrors(
     all nodes.
     """
     taken, remaining = [], jnp.zeros_like(field)
-    planes = all(isinstance(image, Image) for _, image in images)  # they commute
+    planes = all(isinstance(image, Image | WallImage) for _, image in images)  # they commute
     for axis in range(field.shape[1]):
         part = jnp.zeros_like(field).at[:, axis].set(field[:, axis])
         order = list(reversed(images))

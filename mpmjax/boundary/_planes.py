@@ -8,16 +8,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
-from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
+from mpmjax.boundary._contact import AbstractContact, AbstractNodes, ConstrainedNodes
 from mpmjax.boundary._friction import friction_change
-from mpmjax.boundary._surface_contact import Faces, Surface, SurfaceContact, refuse_contact, surface_contact
+from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import Motion
-from mpmjax.potential import Image, Mirror, MirrorPlace, mirror_image, wall_image
+from mpmjax.potential import Image, MirrorPlace, WallImage, mirror_image, wall_image
 
 SHUT = 1e-2
 """The gap up to which a plane holds what is before it, in spacings."""
@@ -160,8 +160,8 @@ class SymmetryPlane(AbstractPlane):
 
 
 class PlaneContact(AbstractContact):
-    """A wall at right angles to an axis in the window. Each column of nodes along its normal is a place, described at
-    all of its nodes.
+    """A wall at right angles to an axis in the window, or two that face each other. Each column of nodes along the
+    normal is a place at each: of shape (layers, ..., 1, ..., s), the shape of the window with 1 for the axis.
 
     Holding a column means that its nodes move by the wall's map (see `wall_image`), with normal velocities B_i v_b. The
     normal impulse is r = Σ (1 − B_i) R_i, with R the impulses that are missing at the nodes: what they leave on b is
@@ -169,86 +169,98 @@ class PlaneContact(AbstractContact):
 
         Σ m_i (1 − B_i S/M) (v_i − B_i v_b),   S = Σ B m,   M = Σ B² m,
 
-    so that the two conditions exclude each other. Columns that no particle reaches whose face is at the wall are not
-    held. Columns that are each other's image in another plane are held together. Friction acts on the first node of a
-    column that has a tangential velocity of its own.
+    so that the two conditions exclude each other, and an explicit step needs no sweep. Columns that no particle reaches
+    whose face is at the wall are not held. Columns that are each other's image in another plane are held together.
+    Friction acts on the first node of a column that has a tangential velocity of its own.
     """
 
-    image: Image
-    """The wall's map."""
-    inward: int = eqx.field(static=True)
-    """The inward normal's component: +1 or −1."""
+    walls: tuple[WallImage, ...]
+    """The walls' maps."""
+    inward: tuple[int, ...] = eqx.field(static=True)
+    """The component of each inward normal: +1 or −1."""
     coefficient: Scalar
     """Coulomb coefficient [-]."""
-    shut: Bool[Array, "n"]
-    """The columns that may be held, shape (n,)."""
+    shut: Bool[Array, "..."]
+    """The columns that may be held."""
 
     @property
-    def mirror_image(self) -> Image:
-        return self.image
+    def axis(self) -> int:
+        """Direction of the normals."""
+        return self.walls[0].axis
 
-    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> NodeScalar:
-        """The momentum with which each column leaves the wall [kg m/s]: its weights times what its velocity lacks of
+    def known_at_start(self, nodes: AbstractNodes) -> bool:
+        """Where nothing else holds the nodes of a column."""
+        return not nodes.conditions.holds
+
+    def images(self, active: Array) -> tuple[WallImage, ...]:
+        return tuple(replace(wall, held=active[..., k : k + 1]) for k, wall in enumerate(self.walls))
+
+    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> Array:
+        """The momentum with which each column leaves its wall [kg m/s]: its weights times what its velocity lacks of
         the map's."""
-        lacking = (v - self.image.vector(v))[:, self.image.axis]
-        columns = self.inward * self.image.column(self._weight(held.unconstrained.mass) * lacking)
-        return self._tied(held, jnp.where(self.shut, columns, 0))
+        mass, along = held.unconstrained.mass, v[:, self.axis]
+        each = [
+            inward * wall.column(column_weight(wall, mass) * (wall.rows(along) - wall.share * wall.row(along)))
+            for inward, wall in zip(self.inward, self.walls, strict=True)
+        ]
+        return self._tied(held, jnp.where(self.shut, jnp.concatenate(each, axis=-1), 0))
 
-    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
+    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Array:
         """The normal impulse of each column [kg m/s]."""
-        return self._tied(held, self._column_impulse(held, residual))
+        impulse = held.without_collider_impulses(residual)[:, self.axis]
+        each = [
+            inward * wall.column(jnp.where(wall.follows, (1 - wall.share) * wall.rows(impulse), 0))
+            for inward, wall in zip(self.inward, self.walls, strict=True)
+        ]
+        return self._tied(held, jnp.concatenate(each, axis=-1))
 
     def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
-        """The rounding of a column's momentum [kg m/s], shape (n,), for both."""
-        least = noise * self._tied(held, self.image.column(self._weight(held.unconstrained.mass)))
+        """The rounding of a column's momentum [kg m/s], for both."""
+        mass = held.unconstrained.mass
+        weights = [wall.column(column_weight(wall, mass)) for wall in self.walls]
+        least = noise * self._tied(held, jnp.concatenate(weights, axis=-1))
         return least, least
 
     def friction(
         self, held: ConstrainedNodes, active: Array, residual: NodeVector
     ) -> Callable[[NodeVector], NodeVector]:
-        impulse = jnp.where(active & self.representative(), self._column_impulse(held, residual), 0)
-        limit = self.coefficient * jnp.maximum(held.images.fold_scalar(impulse), 0)
-        normal = (jnp.arange(residual.shape[1]) == self.image.axis).astype(limit.dtype)
+        limits = self.coefficient * jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0)
+        limit = jnp.zeros(len(residual), limits.dtype)
+        for wall, part in zip(self.walls, jnp.split(limits, len(self.walls), axis=-1), strict=True):
+            limit = wall.with_rows(limit, jnp.where(wall.first, part, wall.rows(limit)))
+        normal = (jnp.arange(residual.shape[1]) == self.axis).astype(limit.dtype)
         return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, 0.0, limit, v)
 
     def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """The normal component of nodes that follow in it alone, as on the wall."""
-        across = self.image.along(self.image.follows & self._stays)
-        return (active & across)[:, None] & (jnp.arange(shape[1]) == self.image.axis)
+        across = jnp.zeros(shape[0], bool)
+        for k, wall in enumerate(self.walls):
+            held = wall.follows & ~wall.tied & active[..., k : k + 1]
+            across = wall.with_rows(across, wall.rows(across) | held)
+        return across[:, None] & (jnp.arange(shape[1]) == self.axis)
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """All components of the columns held."""
-        return jnp.broadcast_to(active[:, None], shape)
+        wall = self.walls[0]
+        columns = jnp.broadcast_to(active.any(axis=-1), (wall.layers, *wall.shape))
+        return jnp.broadcast_to(columns.reshape(-1, 1), shape)
 
-    def representative(self) -> Bool[Array, "n"]:
-        """The first node with a tangential velocity of its own."""
-        before = self._stays[:: self.inward]
-        return self.image.along((before & (jnp.cumsum(before) == 1))[:: self.inward])
-
-    @property
-    def _stays(self) -> Bool[Array, "m"]:
-        """Whether a node has its own tangential velocity."""
-        return self.image.source == jnp.arange(len(self.image.source), dtype=jnp.int32)
-
-    def _weight(self, mass: NodeScalar) -> NodeScalar:
-        """m_i (1 − B_i S/M) [kg] of the nodes that follow b, zero at others, shape (n,)."""
-        share = self.image.along(self.image.shares)
-        first, second = self.image.column(mass * share), self.image.column(mass * share**2)
-        weight = mass * (1 - share * first / jnp.where(second == 0, 1, second))
-        return jnp.where(self.image.along(self.image.follows), weight, 0)
-
-    def _column_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
-        """The normal impulse that holds each column by itself [kg m/s], shape (n,)."""
-        impulse = held.without_collider_impulses(residual)
-        return self.inward * self.image.column(self.image.along(1 - self.image.odd) * impulse[:, self.image.axis])
-
-    def _tied(self, held: ConstrainedNodes, columns: NodeScalar) -> NodeScalar:
-        """A quantity of the columns, summed over columns that are each other's image in other planes, shape (n,)."""
-        contacts = (image for c in held.unconstrained.contacts if (image := c.mirror_image) is not None)
-        for image in (*contacts, *held.unconstrained.mirror.images):
-            if image.axis != self.image.axis:
-                columns = image.scalar(Mirror((image,)).fold_scalar(columns))
+    def _tied(self, held: ConstrainedNodes, columns: Array) -> Array:
+        """A quantity of the columns, summed over columns that are each other's image in other planes."""
+        nodes = held.unconstrained
+        walls = (wall for contact in nodes.contacts if isinstance(contact, PlaneContact) for wall in contact.walls)
+        for image in (*walls, *nodes.mirror.images):
+            if isinstance(image, Image | WallImage) and image.axis != self.axis:
+                columns = image.united(columns)
         return columns
+
+
+def column_weight(wall: WallImage, mass: NodeScalar) -> Array:
+    """m_i (1 − B_i S/M) [kg] of the nodes that follow b, zero at others, as rows of the wall."""
+    rows = wall.rows(mass)
+    first = rows * wall.share
+    total, square = wall.column(first), wall.column(first * wall.share)
+    return jnp.where(wall.follows, rows - first * total / jnp.where(square == 0, 1, square), 0)
 
 
 class ContactPlane(AbstractPlane):
@@ -305,29 +317,22 @@ class ContactPlane(AbstractPlane):
         a gap at once, the faces before the plane are pushed as by a `SeparatingBox` in the step that would bring them
         behind it."""
         del t, dt
-        position = jax.lax.stop_gradient(self.position)  # the lattice goes with it
         assert faces is not None  # as it `sees_faces`
         normal = jnp.zeros_like(faces.x.T).at[self.axis].set(self.inward)
         distance = self.inward * (faces.x[:, self.axis] - self.position)
         landing = surface_contact(Surface(distance, normal, self.friction, axis=self.axis), faces)
         shut = landing.gap <= SHUT * faces.spacing
-        around = scatter(faces.stencil, shut.astype(faces.stencil.offset.dtype), None, grid.size)[:, 0]
-        plane = plane_contact(landing, around, position, self.inward, grid, window)
+        around = scatter(faces.stencil, shut.astype(faces.x.dtype), None, grid.size)
+        order, position = len(faces.stencil.basis.knots) - 1, jax.lax.stop_gradient(self.position)  # the lattice goes
+        wall = wall_image(self.axis, position, self.inward, grid, window, order)
+        plane = plane_contact((wall,), (self.inward,), self.friction, around)
         return (plane,) if faces.explicit else (replace(landing, beside=~shut), plane)
 
 
 def plane_contact(
-    surface: SurfaceContact,
-    around: NodeScalar,
-    position: Scalar,
-    inward: int,
-    grid: Grid,
-    window: Int[Array, "d"],
-    slope: NodeScalar | None = None,
+    walls: tuple[WallImage, ...], inward: tuple[int, ...], friction: Scalar, around: Float[Array, "n s"]
 ) -> PlaneContact:
-    """The contact of a wall across the axis of a surface, at a coordinate [m], with the columns `around` particles
-    whose gap is shut, where their weights have a sum, shape (n,). For `slope` see `wall_image`."""
-    stencil, axis = surface.faces.stencil, surface.axis
-    assert axis is not None
-    image = wall_image(axis, position, inward, grid, window, len(stencil.basis.knots) - 1, slope)
-    return PlaneContact(image, inward, surface.coefficient, image.column(around) > 0)
+    """The contact of walls across an axis with the columns around particles whose gap is shut, where the weights of
+    those have a sum, shape (n, s)."""
+    shut = [wall.column(wall.rows(around[:, k])) > 0 for k, wall in enumerate(walls)]
+    return PlaneContact(walls, inward, friction, jnp.concatenate(shut, axis=-1))

@@ -13,10 +13,11 @@ from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, cross
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._planes import SHUT, plane_contact
-from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
+from mpmjax.boundary._surface_contact import SIGNS, Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import Motion
+from mpmjax.potential import wall_image
 
 
 class AbstractBox(AbstractBoundary):
@@ -196,26 +197,28 @@ class SeparatingBox(AbstractBox):
         self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
     ) -> tuple[AbstractContact, ...]:
         """Springs, and in implicit steps, for what flows, two walls an axis that hold the columns of nodes whose gap is
-        shut; as at a `ContactPlane` springs push it in the step that would bring its faces behind a wall. Explicit
-        steps, which are as short as the springs need, would take several times as long by such walls."""
+        shut; as at a `ContactPlane` springs push it in the step that would bring its faces behind a wall. In explicit
+        steps stirred water would rise between such walls."""
         assert faces is not None  # as it `pushes`
         surfaces = tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
         if faces.explicit or not any(shape.flows for shape in faces.shapes):
             return surfaces
         flowing = np.repeat([shape.flows for shape in faces.shapes], [len(shape.half) for shape in faces.shapes])
         shut = jnp.stack([flowing & (surface.gap <= SHUT * faces.spacing) for surface in surfaces])
-        volumes = [jnp.where(flowing, 2 * faces.width(surface.normal)[0], 0) ** self.dim for surface in surfaces]
-        slopes = jnp.stack([surface.normal * volume for surface, volume in zip(surfaces, volumes, strict=True)], axis=1)
-        # one sum at the nodes for all walls: the slopes of each axis, then what is around each wall
-        weights = jnp.concatenate([jnp.zeros_like(faces.x.T), *shut.astype(faces.x.dtype)])
-        sums = scatter(faces.stencil, weights, slopes, grid.size).T
-        slope, around = sums[: self.dim], sums[self.dim :].reshape(self.dim, 2, -1)
+        # one sum at the nodes for all walls
+        around = scatter(faces.stencil, shut.reshape(-1, len(flowing)).astype(faces.x.dtype), None, grid.size)
         contacts: list[AbstractContact] = []
         for axis, surface in enumerate(surfaces):
             contacts.append(replace(surface, beside=~shut[axis]))
-            for side, (wall, inward) in enumerate(((self.lower, 1), (self.upper, -1))):
-                place = around[axis, side], jnp.asarray(wall)[axis], inward, grid, window
-                contacts.append(plane_contact(surface, *place, slope[axis]))
+            stencil = faces.stencil.along(axis)
+            volume = jnp.where(flowing, 2 * faces.width(surface.normal)[0], 0) ** self.dim
+            slope = scatter(stencil, None, volume[None, None], stencil.basis.shape[0])[:, 0]
+            corners, order = ((self.lower, 1), (self.upper, -1)), len(stencil.basis.knots) - 1
+            walls = tuple(
+                wall_image(axis, jnp.asarray(corner)[axis], inward, grid, window, order, slope)
+                for corner, inward in corners
+            )
+            contacts.append(plane_contact(walls, SIGNS, self.friction, around[:, 2 * axis : 2 * axis + 2]))
         return tuple(contacts)
 
     def deepest(self, wall: Array, spacing: Scalar, reach: float) -> Array:

@@ -146,6 +146,19 @@ class Stencil(eqx.Module):
         first, offset, inside, custom, flat = (a if a is None else a[..., particles] for a in arrays)
         return replace(self, first=first, offset=offset, inside=inside, own_derivatives=custom, flat=flat)
 
+    def along(self, axis: int) -> "Stencil":
+        """The stencil on the nodes of one axis, of whose layers all are one."""
+        shape, flat, custom = self.basis.shape[axis : axis + 1], self.flat, self.own_derivatives
+        part = slice(axis, axis + 1)
+        return replace(
+            self,
+            first=self.first[part] % shape[0],
+            offset=self.offset[part],
+            basis=self.basis._replace(shape=shape, periodic=self.basis.periodic[part]),
+            own_derivatives=None if custom is None else custom[part],
+            flat=None if flat is None else flat[part],
+        )
+
     @property
     def moment(self) -> Float[Array, "d p"]:
         """Diagonal of D_p = Σ_i w_ip (x_i − x_p)(x_i − x_p)ᵀ [m²], shape (d, p)."""

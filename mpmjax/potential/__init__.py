@@ -8,7 +8,7 @@ from mpmjax.potential._mirror import (
     Tie as Tie,
     carried_by as carried_by,
     mirror_image as mirror_image,
-    wall_image as wall_image,
+    with_one_mass as with_one_mass,
 )
 from mpmjax.potential._term import (
     AbstractSpring as AbstractSpring,
@@ -18,3 +18,4 @@ from mpmjax.potential._term import (
     Forces as Forces,
     scattered as scattered,
 )
+from mpmjax.potential._wall_image import WallImage as WallImage, wall_image as wall_image

@@ -8,6 +8,7 @@ are such maps too.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,6 +21,7 @@ from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import require
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import Motion, spinning
+from mpmjax.potential._wall_image import WallImage
 
 
 class MirrorPlace(NamedTuple):
@@ -63,14 +65,8 @@ class Image(eqx.Module):
     """The node of which each node along the axis is a copy, shape (m,)."""
     even: Int[Array, "m"]
     """The sign of copies of even fields, 0 where the source is outside of the window, shape (m,)."""
-    odd: Int[Array, "m"] | Float[Array, "m"]
-    """The factor of copies of odd fields: a sign, 0 on the plane too, or B (see `wall_image`), shape (m,)."""
-    held: Bool[Array, "n"] | None = None
-    """The nodes in columns where there is a mirror; None for all of them."""
-    base: Int[Array, ""] | None = None
-    """The node b of a wall that lies anywhere (see `wall_image`); None at a mirror plane."""
-    scale: NodeScalar | None = None
-    """Factor of the normal velocity of b and of what follows it [-], shape (n,) (see `with_one_mass`); None for 1."""
+    odd: Int[Array, "m"]
+    """The sign of copies of odd fields, 0 on the plane too, shape (m,)."""
     velocity: Scalar | None = None
     """Velocity V of a mirror that moves along its normal [m/s]; None at rest. The normal velocity of a node beyond it
     is 2V minus that of its image, and V on it."""
@@ -82,48 +78,25 @@ class Image(eqx.Module):
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
         """B for an even scalar field."""
-        return self._copy(field[:, None], self.source, self.even[:, None]).reshape(field.shape)
+        return self._even(field.reshape(self.layers, *self.shape, 1)).reshape(field.shape)
+
+    def united(self, blocks: Array) -> Array:
+        """Even scalars, summed over the nodes that are each other's image, at each of them: B Bᵀ on blocks (see
+        `WallImage`)."""
+        return self._even(transposed(self._even, blocks))
+
+    def _even(self, blocks: Array) -> Array:
+        return self._copy(blocks, self.even[:, None])
 
     def vector(self, field: NodeVector) -> NodeVector:
         """B for a vector field: tangential components even, the normal one odd. Of a mirror that moves B v + ℓ, where ℓ
         is the normal component that the field has on the mirror and beyond."""
         normal = jnp.arange(field.shape[1]) == self.axis
-        if self.base is not None:
-            source = jnp.where(self.follows, self.base, jnp.arange(len(self.odd), dtype=jnp.int32))
-            across = self._copy(field, source, self.odd[:, None])
-            across = across if self.scale is None else self.scale[:, None] * across
-            return jnp.where(normal, across, self._copy(field, self.source, self.even[:, None]))
-        copied = self._copy(field, self.source, jnp.where(normal, self.odd[:, None], self.even[:, None]))
+        signs = jnp.where(normal, self.odd[:, None], self.even[:, None])
+        copied = self._copy(field.reshape(self.layers, *self.shape, -1), signs).reshape(field.shape)
         if self.velocity is None:
             return copied
         return copied + jnp.where(self.normal(self.odd <= 0, field.shape[1]), field, 0)
-
-    def within(self, held: Bool[Array, "n"]) -> "Image":
-        """The mirror in some columns only."""
-        return replace(self, held=held)
-
-    @property
-    def follows(self) -> Bool[Array, "m"]:
-        """The nodes whose normal velocity is that of b times less than 1."""
-        return self.odd < 1
-
-    @property
-    def shares(self) -> Float[Array, "m"]:
-        """B of b and of the nodes that follow it, zero at others."""
-        return jnp.where(self.follows | (jnp.arange(len(self.odd), dtype=jnp.int32) == self.base), self.odd, 0)
-
-    def with_one_mass(self, mass: NodeScalar, others: "Mirror") -> "Image":
-        """The map whose b has the mass Σ m along the wall and across it, by a unit of the velocity across it: there it
-        is Σ B² m. `others` are the maps that fold the masses of all nodes [kg], shape (n,), before."""
-        if self.base is None:
-            return self
-        mass = others.fold_scalar(mass)
-        across = self.column(mass * self.along(self.shares**2))
-        along = self.column(jnp.where(self.along(self.source == self.base), mass, 0))
-        both = (across > 0) & (along > 0)
-        scale = jnp.sqrt(jnp.where(both, along / jnp.where(both, across, 1), 1))
-        held = self.along(self.shares != 0) if self.held is None else self.held & self.along(self.shares != 0)
-        return replace(self, scale=others.unfold_scalar(jnp.where(held, scale, 1)))
 
     def normal(self, along: Bool[Array, "m"], dim: int) -> Mask:
         """The normal component of some nodes along the axis, as a mask of shape (n, d)."""
@@ -135,19 +108,48 @@ class Image(eqx.Module):
         by_axis[self.axis] = -1
         return jnp.broadcast_to(values.reshape(by_axis), (self.layers, *self.shape)).reshape(-1)
 
-    def column(self, field: NodeScalar) -> NodeScalar:
-        """The sum over each column, at all of its nodes."""
-        blocks = field.reshape(self.layers, *self.shape)
-        return jnp.broadcast_to(blocks.sum(axis=self.axis + 1, keepdims=True), blocks.shape).reshape(-1)
-
-    def _copy(self, field: Array, source: Array, sign: Array) -> Array:
-        """Copy from `source` along the axis; `sign` has one row a node of the axis and one column a component."""
-        blocks = field.reshape(self.layers, *self.shape, -1)
+    def _copy(self, blocks: Array, sign: Array) -> Array:
+        """Copy along the axis; `sign` has one row a node of the axis and one column a component."""
         by_axis = [1] * blocks.ndim
         by_axis[self.axis + 1], by_axis[-1] = sign.shape
-        copied = jnp.take(blocks, source, axis=self.axis + 1, mode="clip") * sign.reshape(by_axis).astype(field.dtype)
-        copied = copied.reshape(field.shape)
-        return copied if self.held is None else jnp.where(self.held[:, None], copied, field)
+        copied = jnp.take(blocks, self.source, axis=self.axis + 1, mode="clip")
+        return copied * sign.reshape(by_axis).astype(blocks.dtype)
+
+
+class Scaling(eqx.Module):
+    """A factor of each component of velocity, by which nodes that walls tie to others have one mass for all of them."""
+
+    factor: NodeVector
+    """Shape (n, d) [-]."""
+    axis: ClassVar[int] = -1
+
+    def scalar(self, field: NodeScalar) -> NodeScalar:
+        """Scalars are as they are."""
+        return field
+
+    def vector(self, field: NodeVector) -> NodeVector:
+        """The field times the factor."""
+        return self.factor * field
+
+
+def with_one_mass(walls: tuple[WallImage, ...], mass: NodeScalar, dim: int) -> tuple["Mirror", NodeScalar]:
+    """The maps of walls that hold nodes of these masses [kg], shape (n,), with a scaling before them, and the masses
+    folded by them: a node b has the mass Σ m along the wall, and across it Σ B² m by a unit of its velocity; it is
+    scaled so that both are one."""
+    if not walls:
+        return Mirror(()), mass
+    masses = jnp.broadcast_to(mass[:, None], (len(mass), dim + 1))
+    for wall in reversed(walls):
+        masses = wall.fold_masses(masses)
+    across, along = masses[:, :dim], masses[:, dim:]
+    both = (across > 0) & (along > 0)
+    factor = jnp.sqrt(jnp.where(both, along, 1) / jnp.where(both, across, 1))
+    return Mirror((Scaling(factor), *walls)), masses[:, dim]
+
+
+def transposed(linear: Callable[[Array], Array], field: Array) -> Array:
+    """The transpose of a linear map of a field to one alike."""
+    return jax.linear_transpose(linear, field)(field)[0]
 
 
 class Tie(eqx.Module):
@@ -214,7 +216,7 @@ class RigidImage(eqx.Module):
 class Mirror(eqx.Module):
     """The mirrors of several planes: `unfold` applies B, from true nodes to all nodes; `fold` applies Bᵀ."""
 
-    images: tuple[Image | Tie | RigidImage, ...]
+    images: tuple[Image | WallImage | Scaling | Tie | RigidImage, ...]
 
     def unfold(self, field: NodeVector) -> NodeVector:
         """B v: fill in the mirror images."""
@@ -224,10 +226,13 @@ class Mirror(eqx.Module):
 
     def fold(self, field: NodeVector) -> NodeVector:
         """Bᵀ f: add to the true nodes what their mirror images received, and leave nothing on the others."""
-        if not self.images:
-            return field
-        at_rest = (replace(image, velocity=None) if isinstance(image, Image) else image for image in self.images)
-        return jax.linear_transpose(Mirror(tuple(at_rest)).unfold, field)(field)[0]
+        for image in reversed(self.images):
+            if isinstance(image, WallImage):
+                field = image.fold(field)
+            else:
+                at_rest = replace(image, velocity=None) if isinstance(image, Image) else image
+                field = transposed(at_rest.vector, field)
+        return field
 
     @property
     def moving(self) -> tuple[tuple[Image, Scalar], ...]:
@@ -257,11 +262,16 @@ class Mirror(eqx.Module):
 
     def fold_scalar(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
         """Bᵀ for an even scalar."""
-        return jax.linear_transpose(self.unfold_scalar, field)(field)[0] if self.images else field
+        for image in reversed(self.images):
+            field = image.fold_scalar(field) if isinstance(image, WallImage) else transposed(image.scalar, field)
+        return field
 
     def fold_scalars(self, field: Float[Array, "n c"]) -> Float[Array, "n c"]:
         """Bᵀ for even scalars in columns."""
-        return jnp.stack([self.fold_scalar(column) for column in field.T], axis=1) if self.images else field
+        for image in reversed(self.images):
+            columns = jax.vmap(image.scalar, in_axes=1, out_axes=1)
+            field = image.fold_scalar(field) if isinstance(image, WallImage) else transposed(columns, field)
+        return field
 
     def continued(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
         """A folded even scalar as it is where bodies go on beyond the planes: on a plane twice what is folded there."""
@@ -294,42 +304,3 @@ def mirror_image(axis: int, position: Scalar, keep: str, grid: Grid, window: Int
     even = jnp.where(inside, 1, 0)
     odd = jnp.where(inside & (before != 0), jnp.where(ghost, -1, 1), 0)
     return Image(grid.shape, grid.layers, axis, jnp.clip(source, 0, length - 1), even, odd)
-
-
-def wall_image(
-    axis: int,
-    position: Scalar,
-    inward: int,
-    grid: Grid,
-    window: Int[Array, "d"],
-    order: int,
-    slope: NodeScalar | None = None,
-) -> Image:
-    """The map of a wall at any coordinate [m] along an axis, for a kernel of this order.
-
-    With ξ the distance of a node before the wall, b is the nearest one before it that no kernel at the wall passes:
-    ξ_b ≥ ½ for quadratic kernels. Nodes behind b have its normal velocity times B = ξ/ξ_b, so that it is zero on the
-    wall, and fields that are linear across it are in the map: forces of a uniform pressure, which have neither sum nor
-    first moment about the wall, vanish. Nodes more than a quarter of a spacing behind the wall have the tangential
-    velocity of b. With the wall on a node or half-way between nodes this is the mirror.
-
-    Sums over particles are no integrals: by `slope`, the volumes of particles times g_ip along the axis, summed at the
-    nodes [m²], shape (n,), the wall is moved by up to 0.02 spacings to where a uniform pressure has no moment.
-    """
-    j, near = jnp.arange(grid.shape[axis], dtype=jnp.int32), 1e-3  # what is as near to ½ or −¼ counts as there
-    place = jnp.asarray(position)
-    lattice, length = (j + window[axis]).astype(place.dtype), len(j) * grid.spacing
-    first = lattice[0] * grid.spacing
-    place = jnp.clip(place, first - length, first + 2 * length)  # a wall that is none is infinitely far
-    before = inward * (lattice - place / grid.spacing)
-    free = before > max(order - 1, 1) / 2 - near
-    base = jnp.argmin(jnp.where(free, before, jnp.inf)).astype(j.dtype)
-    source = jnp.where(before > -0.25 - near, j, base)
-    if slope is not None:
-        others = tuple(k for k in range(grid.dim + 1) if k != axis + 1)
-        force = jnp.where(free & (j != base), 0, slope.reshape(grid.layers, *grid.shape).sum(others))
-        total = force.sum()
-        middle = jnp.where(total == 0, 0, (force * before).sum() / jnp.where(total == 0, 1, total))
-        before = before - jnp.clip(middle, -0.02, 0.02)
-    odd = jnp.where(free, 1, before / jnp.where(free[base], before[base], 1))
-    return Image(grid.shape, grid.layers, axis, source, jnp.ones_like(j), odd, base=base)

@@ -102,9 +102,10 @@ def impulse_on_boundaries(
         parts.append(OwnedImpulse(part.impulse, jnp.where(part.owner < 0, -1, numbers[part.owner])))
         residual = residual - part.impulse
     columns = [
-        (number, image.within(active))
+        (number, image)
         for number, contact, active in contacts
-        if number is not None and (image := contact.mirror_image) is not None
+        if number is not None
+        for image in contact.images(active)
     ]
     of_planes, residual = taken_by_mirrors(residual, columns)
     parts += [*of_planes, OwnedImpulse(residual, owners)]

@@ -146,11 +146,12 @@ class Nodes(AbstractNodes):
             return self.pushed(force)
         return replace(self, g=self.g + self.per_mass(force))
 
-    def folded(self, images: Mirror) -> "Nodes":
+    def folded(self, images: Mirror, mass: NodeScalar | None = None) -> "Nodes":
         """The nodes with the sums of their images at mirror planes added. A force is folded as the momentum that it
-        makes is."""
+        makes is; the folded mass may be known already."""
         conditions = replace(self.conditions, moves=self.conditions.moves or bool(images.moving))
-        folded = replace(self, mass=images.fold_scalar(self.mass), conditions=conditions)
+        mass = images.fold_scalar(self.mass) if mass is None else mass
+        folded = replace(self, mass=mass, conditions=conditions)
 
         def fold(field: Array) -> NodeVector:
             """Fold a field per mass."""
@@ -164,9 +165,10 @@ class Nodes(AbstractNodes):
             potential=replace(self.potential, mirror=Mirror(images.images + self.potential.mirror.images)),
         )
 
-    def constrained(self, images: Mirror, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "Nodes":
-        """The nodes folded at these mirrors, with the components `fixed` held, and the force of further terms."""
-        nodes = self.folded(images) if images.images else self
+    def constrained(self, images: Mirror, mass: NodeScalar, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "Nodes":
+        """The nodes folded at these mirrors to these masses, with the components `fixed` held, and the force of further
+        terms."""
+        nodes = self.folded(images, mass) if images.images else self
         nodes = replace(nodes, conditions=replace(self.conditions, fixed=fixed, holds=True))
         if not terms:
             return nodes

@@ -179,10 +179,10 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator, t: Sc
         # the fastest rate at which the present acceleration a strains each particle: the eigenvalue of the symmetric
         # part of ∇a that is largest in magnitude, or |div a| for a law that knows J alone
         at_rest = ConstrainedNodes(nodes, (), Mirror(()), nodes)
-        contacts = [contact for contact in nodes.contacts if contact.known_at_start]
+        contacts = [contact for contact in nodes.contacts if contact.known_at_start(nodes)]
         springs = (contact.springs(contact.likely_held(at_rest, nodes.velocity)) for contact in contacts)
         terms = tuple(spring for spring in springs if spring is not None)
-        pushed = nodes.constrained(Mirror(()), nodes.conditions.fixed, terms)
+        pushed = nodes.constrained(Mirror(()), nodes.mass, nodes.conditions.fixed, terms)
         a = pushed.projection.combine(pushed.per_mass(pushed.force) + pushed.acceleration, 0.0)
         slopes = gather(stencil, nodes.mirror.unfold(a))[1]
         rates, fastest = la.symmetric_eigen((slopes + la.transpose(slopes)) / 2)[0], []

@@ -1,0 +1,156 @@
+"""Walls that lie anywhere across an axis: the map of the nodes about them, linear across the wall."""
+
+from functools import reduce
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
+from mpmjax.discretisation import Grid
+
+
+class WallImage(eqx.Module):
+    """The map of a wall that lies anywhere across an axis (see `wall_image`), in the columns of nodes that it holds.
+
+    It touches the K *rows* of nodes from b to a spacing and a kernel behind the wall: a slice of the grid. Blocks are
+    fields in the shape of the window (layers, ..., m, ..., c), with c values at each node; rows have K for m, a row and
+    columns 1, and so have the masks of rows, which broadcast with them.
+    """
+
+    shape: tuple[int, ...] = eqx.field(static=True)
+    """The grid's shape, of each of its layers."""
+    layers: int = eqx.field(static=True)
+    axis: int = eqx.field(static=True)
+    start: Int[Array, ""]
+    """The first row's number along the axis."""
+    b: Int[Array, ""]
+    """The number of the row b."""
+    base: Bool[Array, "..."]
+    """The row b."""
+    follows: Bool[Array, "..."]
+    """The rows behind b, which have its normal velocity times B."""
+    share: Float[Array, "..."]
+    """B of b, which is 1, and of the rows behind it; zero at others."""
+    tied: Bool[Array, "..."]
+    """The rows that have the tangential velocity of b."""
+    first: Bool[Array, "..."]
+    """The first row from behind that has a tangential velocity of its own."""
+    held: Bool[Array, "..."] | None = None
+    """The columns where the wall holds; None for all of them."""
+
+    def blocks(self, field: Array) -> Array:
+        """A field of shape (n,) or (n, c), or blocks, as blocks."""
+        return field if field.ndim > 2 else field.reshape(self.layers, *self.shape, -1)
+
+    def rows(self, field: Array) -> Array:
+        """The rows of a field."""
+        return self._rows(self.blocks(field), self.start, self.share.shape[self.axis + 1])
+
+    def row(self, field: Array) -> Array:
+        """The row b of a field."""
+        return self._rows(self.blocks(field), self.b, 1)
+
+    def with_rows(self, field: Array, rows: Array) -> Array:
+        """A field with other rows."""
+        blocks, place = self.blocks(field), (self.start, self.axis + 1)
+        blocks = jax.lax.dynamic_update_slice_in_dim(blocks, rows, *place, allow_negative_indices=False)
+        return blocks.reshape(field.shape)
+
+    def column(self, rows: Array) -> Array:
+        """The sum over the rows of each column, as columns."""
+        axis = self.axis + 1  # term by term, which XLA makes part of what reads the sum
+        return reduce(jnp.add, (jax.lax.slice_in_dim(rows, k, k + 1, axis=axis) for k in range(rows.shape[axis])))
+
+    def scalar(self, field: Array) -> Array:
+        """B for an even scalar field."""
+        return self._copied(field, self.tied, 1)
+
+    def fold_scalar(self, field: Array) -> Array:
+        """Bᵀ for an even scalar field."""
+        return self._gathered(field, self.tied, 1)
+
+    def united(self, blocks: Array) -> Array:
+        """Even scalars, summed over the nodes that are tied to each other, at each of them (as B Bᵀ does)."""
+        rows, alike = self.rows(blocks), self.base | self.tied
+        return self.with_rows(blocks, jnp.where(alike, self.column(jnp.where(alike, rows, 0)), rows))
+
+    def vector(self, field: NodeVector) -> NodeVector:
+        """B for a vector field."""
+        return self._copied(field, *self._components(jnp.arange(field.shape[1]) == self.axis, self.share))
+
+    def fold(self, field: NodeVector) -> NodeVector:
+        """Bᵀ for a vector field."""
+        return self._gathered(field, *self._components(jnp.arange(field.shape[1]) == self.axis, self.share))
+
+    def fold_masses(self, masses: Float[Array, "n c"]) -> Float[Array, "n c"]:
+        """The masses that b has along each direction by a unit of its velocity [kg], then its mass as a scalar, and
+        none on what follows: Σ B² m across the wall, shape (n, d + 1)."""
+        return self._gathered(masses, *self._components(jnp.arange(masses.shape[1]) == self.axis, self.share**2))
+
+    def _rows(self, blocks: Array, start: Array, count: int) -> Array:
+        return jax.lax.dynamic_slice_in_dim(blocks, start, count, self.axis + 1, allow_negative_indices=False)
+
+    def _components(self, normal: Bool[Array, "c"], share: Array) -> tuple[Array, Array]:
+        """Which rows follow b in each component, and by which factor."""
+        return jnp.where(normal, self.follows, self.tied), jnp.where(normal, share, 1)
+
+    def _copied(self, field: Array, follows: Array, factor: Array | int) -> Array:
+        follows = follows if self.held is None else follows & self.held
+        return self.with_rows(field, jnp.where(follows, factor * self.row(field), self.rows(field)))
+
+    def _gathered(self, field: Array, follows: Array, factor: Array | int) -> Array:
+        follows, rows = follows if self.held is None else follows & self.held, self.rows(field)
+        total = self.column(jnp.where(follows, factor * rows, 0))
+        return self.with_rows(field, jnp.where(follows, 0, rows + jnp.where(self.base, total, 0)))
+
+
+def wall_image(
+    axis: int,
+    position: Scalar,
+    inward: int,
+    grid: Grid,
+    window: Int[Array, "d"],
+    order: int,
+    slope: Float[Array, "m"] | None = None,
+) -> WallImage:
+    """The map of a wall at any coordinate [m] along an axis, for a kernel of this order.
+
+    With ξ the distance of a node before the wall, b is the nearest one before it that no kernel at the wall passes:
+    ξ_b ≥ ½ for quadratic kernels. Nodes behind b have its normal velocity times B = ξ/ξ_b, so that it is zero on the
+    wall, and fields that are linear across it are in the map: forces of a uniform pressure, which have neither sum nor
+    first moment about the wall, vanish. Nodes more than a quarter of a spacing behind the wall have the tangential
+    velocity of b. With the wall on a node or half-way between nodes this is the mirror.
+
+    Sums over particles are no integrals: by `slope`, the volumes of particles times the gradient's factors along the
+    axis, summed at the nodes of the axis [m^(d-1)], shape (m,), the wall is moved by up to 0.02 spacings to where a
+    uniform pressure has no moment.
+    """
+    near, length = 1e-3, grid.shape[axis]  # what is as near to ½ or −¼ counts as there
+    count = min(order + 3, length)  # from b to the nodes of what is a spacing behind the wall
+    place = jnp.asarray(position) / grid.spacing  # then from the window's first node, of a wall that is none far off
+    place = jnp.clip(place - window[axis].astype(place.dtype), -length, 2 * length)
+    base = inward * (jnp.floor(inward * place + max(order - 1, 1) / 2 - near).astype(jnp.int32) + 1)
+    start = jnp.clip(base - count + 1 if inward > 0 else base, 0, length - count)
+    j = start + jnp.arange(count, dtype=jnp.int32)
+    before, of_base = (inward * (row.astype(place.dtype) - place) for row in (j, base))
+    follows, stays = inward * (j - base) < 0, before > -0.25 - near
+    if slope is not None:
+        force = jnp.where(follows | (j == base), jax.lax.dynamic_slice_in_dim(slope, start, count), 0)
+        total = force.sum()
+        middle = jnp.where(total == 0, 0, (force * before).sum() / jnp.where(total == 0, 1, total))
+        middle = jnp.clip(middle, -0.02, 0.02)
+        before, of_base = before - middle, of_base - middle
+    by_row = [count if k == axis + 1 else 1 for k in range(grid.dim + 2)]
+    return WallImage(
+        shape=grid.shape,
+        layers=grid.layers,
+        axis=axis,
+        start=start,
+        b=jnp.clip(base, 0, length - 1),
+        base=(j == base).reshape(by_row),
+        follows=follows.reshape(by_row),
+        share=jnp.where(j == base, 1, jnp.where(follows, before / of_base, 0)).reshape(by_row),
+        tied=(follows & ~stays).reshape(by_row),
+        first=(stays & (before - 1 <= -0.25 - near)).reshape(by_row),
+    )
