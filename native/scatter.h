@@ -65,6 +65,13 @@ void wipe(T* numbers, int64_t size, int64_t first, int64_t last) {
   }
 }
 
+// The least and the largest of a block's numbers; min_element's search would take branches.
+MPMJAX_INLINE Range range_of(const int32_t* least, const int32_t* most, int count) {
+  Range range = {least[0], most[0]};
+  for (int q = 1; q < count; ++q) range = {std::min(range.least, least[q]), std::max(range.most, most[q])};
+  return range;
+}
+
 // Marks the blocks of kChunk nodes, of a range from a first to before a last, that particles reach. Those of a block
 // of particles reach, for each index of the first axis, from the least to the most that the axes after it add.
 template <class T, int d, int s>
@@ -75,13 +82,12 @@ void mark(const Stencils<T>& stencils, const Range* ranges, bool* reached, int64
     const int count = smaller(stencils.particles - start, kBlock);
     Block<T, d, s> block;
     block.find_range(stencils, start, count);
-    const int64_t least = *std::min_element(block.least_beyond, block.least_beyond + count);
-    const int64_t most = *std::max_element(block.most_beyond, block.most_beyond + count);
+    const Range beyond = range_of(block.least_beyond, block.most_beyond, count);
     for (int i = 0; i < s; ++i) {
       for (int q = 0; q < count; ++q) {
         const int64_t term = block.index[0][i][q];
         if (q > 0 && term == block.index[0][i][q - 1]) continue;
-        const int64_t from = std::max(term + least, first), to = std::min(term + most, last - 1);
+        const int64_t from = std::max(term + beyond.least, first), to = std::min(term + beyond.most, last - 1);
         for (int64_t k = from / kChunk; from <= to && k <= to / kChunk; ++k) reached[k] = true;
       }
     }
@@ -224,7 +230,7 @@ void find_ranges(const Stencils<T>& stencils, int64_t first, int64_t last, Range
     const int count = smaller(stencils.particles - k * kBlock, kBlock);
     Block<T, d, s> block;
     block.find_range(stencils, k * kBlock, count);
-    ranges[k] = {*std::min_element(block.least, block.least + count), *std::max_element(block.most, block.most + count)};
+    ranges[k] = range_of(block.least, block.most, count);
   }
 }
 
@@ -328,16 +334,6 @@ void divide(const Average<T>& task, int64_t first, int64_t last) {
   }
 }
 
-template <class T>
-void divide_all(const Average<T>& task, int64_t first, int64_t last) {
-  switch (task.columns) {
-    case 2: return divide<T, 2>(task, first, last);
-    case 3: return divide<T, 3>(task, first, last);
-    case 4: return divide<T, 4>(task, first, last);
-    default: return divide<T, 0>(task, first, last);
-  }
-}
-
 template <class T, int d, int s>
 void average(const Average<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns, others = columns - 1;
@@ -353,7 +349,9 @@ void average(const Average<T>& task, int64_t first, int64_t last) {
   const Scatter<T> sums = {task.stencils, task.values, task.sums, task.ranges, nullptr, task.size, columns, nullptr};
   add_all<T, d, s>(sums, first, last);
   over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
-    if (reached) divide_all(task, from, to);
+    if (!reached) return;
+    if (columns == 4) return divide<T, 4>(task, from, to);
+    columns == 3 ? divide<T, 3>(task, from, to) : divide<T, 0>(task, from, to);
   });
 }
 
