@@ -279,6 +279,7 @@ void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
 
 template <class T, int d, int s>
 void gather(const Gather<T>& task, int64_t first, int64_t last) {
+  if (task.columns == 1) return gather_columns<T, d, s, 1>(task, first, last);
   if (task.columns == d) return gather_columns<T, d, s, d>(task, first, last);
   if (task.columns == d + 1) return gather_columns<T, d, s, d + 1>(task, first, last);
   gather_columns<T, d, s, 0>(task, first, last);
