@@ -61,12 +61,23 @@ class AbstractProblem(eqx.Module):
         """Duration of the run [s]."""
 
     @abc.abstractmethod
-    def grid(self, cells: int) -> Grid:
-        """The grid, with `cells` cells to a metre."""
+    def box(self) -> tuple[tuple[float, ...], tuple[float, ...], Ends]:
+        """The corners of the box that the grid covers [m], whose sides are whole numbers of cells, and how it ends."""
 
-    @abc.abstractmethod
+    def grid(self, cells: int) -> Grid:
+        """The grid, with `cells` cells to a metre: one period of the box, or the box with a margin."""
+        lower, upper, ends = self.box()
+        counts = tuple(round((b - a) * cells) for a, b in zip(lower, upper, strict=True))
+        first = tuple(round(a * cells) for a in lower)
+        if ends is Ends.PERIODIC:
+            return Grid(counts, 1 / cells, origin=first, periodic=True)
+        room = 2 * _MARGIN + 1
+        return Grid(tuple(n + room for n in counts), 1 / cells, origin=tuple(i - _MARGIN for i in first))
+
     def body(self, cells: int) -> AbstractRegion:
-        """The region of the body at rest, on this grid."""
+        """The region of the body at rest, on this grid. Default: the box."""
+        del cells
+        return Box(*self.box()[:2])
 
     def rest(self, cells: int, per_side: int, *, fitted: bool = False) -> Particles:
         """The particles at rest on this grid, `per_side` to the side of a cell. Default: those of `fill`."""
@@ -115,16 +126,6 @@ class Manufactured(AbstractBodyForce):
     def acceleration(self, x: ParticleVector, t: Scalar) -> ParticleVector:
         del x
         return jax.vmap(lambda X: self.problem.body_force(X, t))(self.X)
-
-
-def box_grid(lower: tuple[float, ...], upper: tuple[float, ...], cells: int, ends: Ends) -> Grid:
-    """A grid for a box whose sides are whole numbers of cells: one period, or the box with a margin."""
-    counts = [round((b - a) * cells) for a, b in zip(lower, upper, strict=True)]
-    first = [round(a * cells) for a in lower]
-    if ends is Ends.PERIODIC:
-        return Grid(tuple(counts), 1 / cells, origin=tuple(first), periodic=True)
-    room = 2 * _MARGIN + 1
-    return Grid(tuple(n + room for n in counts), 1 / cells, origin=tuple(i - _MARGIN for i in first))
 
 
 def box_boundary(lower: tuple[float, ...], upper: tuple[float, ...], ends: Ends) -> tuple[AbstractBoundary, ...]:
@@ -294,9 +295,8 @@ class AbstractColumn(AbstractProblem):
     def grid(self, cells: int) -> Grid:
         return Grid((cells + 8,), 1 / (cells + self.shift), origin=(-3,))
 
-    def body(self, cells: int) -> Box:
-        del cells
-        return Box((0.0,), (1.0,))
+    def box(self) -> tuple[tuple[float, ...], tuple[float, ...], Ends]:
+        return (0.0,), (1.0,), Ends.MIRRORED
 
     def rest(self, cells: int, per_side: int, *, fitted: bool = False) -> Particles:
         del fitted  # they always are

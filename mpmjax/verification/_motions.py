@@ -14,7 +14,7 @@ from mpmjax.discretisation import Grid
 from mpmjax.geometry import Annulus, Ball, Box
 from mpmjax.material import AbstractMaterial, FixedCorotated, NeoHookean
 from mpmjax.state import Particles, Scene, fill
-from mpmjax.verification._exact_problem import AbstractProblem, Ends, box_boundary, box_grid
+from mpmjax.verification._exact_problem import AbstractProblem, Ends, box_boundary
 
 _PHASES = {1: (0.0,), 2: (0.0, 1.0), 3: (0.0, 2 / 3, 4 / 3)}  # of π
 
@@ -48,18 +48,11 @@ class AxisAligned(AbstractProblem):
         phase = jnp.pi * jnp.asarray(_PHASES[self.dim], X.dtype)
         return X + self.amplitude * jnp.sin(jnp.pi * X) * jnp.sin(jnp.pi * self.bar_speed * t + phase)
 
-    def grid(self, cells: int) -> Grid:
-        return box_grid(*self._corners(), cells, self.ends)
-
-    def body(self, cells: int) -> Box:
-        del cells
-        return Box(*self._corners())
+    def box(self) -> tuple[tuple[float, ...], tuple[float, ...], Ends]:
+        return ((-1.0 if self.ends is Ends.PERIODIC else 0.0),) * self.dim, (1.0,) * self.dim, self.ends
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
-        return box_boundary(*self._corners(), self.ends)
-
-    def _corners(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return ((-1.0 if self.ends is Ends.PERIODIC else 0.0),) * self.dim, (1.0,) * self.dim
+        return box_boundary(*self.box())
 
 
 class VibratingBar(AbstractProblem):
@@ -101,12 +94,8 @@ class VibratingBar(AbstractProblem):
         omega = self.frequency
         return X + self.speed / omega * jnp.sin(omega * t) * jnp.sin(self.wave_number * X)
 
-    def grid(self, cells: int) -> Grid:
-        return box_grid((0.0,), (self.length,), cells, Ends.MIRRORED)
-
-    def body(self, cells: int) -> Box:
-        del cells
-        return Box((0.0,), (self.length,))
+    def box(self) -> tuple[tuple[float, ...], tuple[float, ...], Ends]:
+        return (0.0,), (self.length,), Ends.MIRRORED
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
         """Fixed at X = 0."""
@@ -147,8 +136,8 @@ class ExpandingRing(AbstractProblem):
         over = (6 * a * b - 3 * (a + b) * R + 2 * R**2) / (a**2 * (3 * b - a))
         return X * (1 + self.amplitude * jnp.sin(jnp.pi * self.bar_speed * t) * over)
 
-    def grid(self, cells: int) -> Grid:
-        return box_grid((-1.0,) * 2, (1.0,) * 2, cells, Ends.PLAIN)
+    def box(self) -> tuple[tuple[float, ...], tuple[float, ...], Ends]:
+        return (-1.0,) * 2, (1.0,) * 2, Ends.PLAIN
 
     def body(self, cells: int) -> Annulus:
         del cells
@@ -199,8 +188,8 @@ class Vortex(AbstractProblem):
         cos, sin = jnp.cos(turn), jnp.sin(turn)
         return jnp.stack([cos * X[0] - sin * X[1], sin * X[0] + cos * X[1]])
 
-    def grid(self, cells: int) -> Grid:
-        return box_grid((-1.5,) * 2, (1.5,) * 2, cells, Ends.PLAIN)
+    def box(self) -> tuple[tuple[float, ...], tuple[float, ...], Ends]:
+        return (-1.5,) * 2, (1.5,) * 2, Ends.PLAIN
 
     def body(self, cells: int) -> Annulus:
         del cells
@@ -246,9 +235,12 @@ class StandingWave(AbstractProblem):
         c = jnp.sqrt(jnp.asarray(law.lame_lambda + 2 * law.shear_modulus) / self.density)
         return X.at[0].add(self.amplitude * jnp.sin(jnp.pi * X[0]) * jnp.cos(jnp.pi * c * t))
 
+    def box(self) -> tuple[tuple[float, ...], tuple[float, ...], Ends]:
+        """In the first direction."""
+        return ((-1.0 if self.ends is Ends.PERIODIC else 0.0),), (1.0,), self.ends
+
     def grid(self, cells: int) -> Grid:
-        along = box_grid(self._ends()[:1], self._ends()[1:], cells, self.ends)
-        across = self.dim - 1
+        along, across = super().grid(cells), self.dim - 1
         return Grid(
             (*along.shape, *(_ACROSS,) * across),
             along.spacing,
@@ -257,17 +249,14 @@ class StandingWave(AbstractProblem):
         )
 
     def body(self, cells: int) -> Box:
-        (low, high), across = self._ends(), self.dim - 1
-        return Box((low, *(0.0,) * across), (high, *(_ACROSS / cells,) * across))
+        (low, high, _), across = self.box(), self.dim - 1
+        return Box((*low, *(0.0,) * across), (*high, *(_ACROSS / cells,) * across))
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
         if self.ends is Ends.PLAIN:
             across = (math.inf,) * (self.dim - 1)
             return (SlipBox((0.0, *(-a for a in across)), (1.0, *across)),)
-        return box_boundary((0.0,), (1.0,), self.ends)
-
-    def _ends(self) -> tuple[float, float]:
-        return (-1.0 if self.ends is Ends.PERIODIC else 0.0), 1.0
+        return box_boundary(*self.box())
 
 
 class TwoDisks(eqx.Module):
