@@ -10,7 +10,6 @@ from jax.core import ShapedArray as ShapedArray, Tracer as Tracer
 from jax.extend.core import Primitive as Primitive
 from jax.interpreters.ad import (
     Zero as Zero,
-    add_tangents as add_tangents,
     instantiate_zeros as instantiate_zeros,
     is_undefined_primal as is_undefined_primal,
     primitive_jvps as primitive_jvps,
