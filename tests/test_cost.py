@@ -387,7 +387,13 @@ def every(jaxpr, name):
 def test_a_gradient_repeats_no_solve(boundary):
     """Steps are computed again in reverse mode, solutions and active sets are not."""
     forward, gradient, _ = reverse(mpm.SemiImplicit(), boundary=boundary)
-    assert len(every(gradient, "custom__solve")) == len(every(forward, "custom__solve")) > 0
+    stages = [
+        [
+            e for e in every(jaxpr, "custom_solve") if e.params["call"].function.kernel is None
+        ]  # the kernel has that name
+        for jaxpr in (gradient, forward)
+    ]
+    assert len(stages[0]) == len(stages[1]) > 0
 
 
 def test_a_gradient_stores_no_more_than_the_state_before_each_step():
