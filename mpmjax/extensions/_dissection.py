@@ -106,7 +106,7 @@ def dissected_factor(dissection: Dissection, entries: Callable[[Array, Array], F
             return F + jnp.eye(*F.shape, dtype=F.dtype) * (numbers[:eliminated] >= dissection.size).astype(F.dtype)
 
         def front(one: tuple[Array, Array, Array], eliminated: int = eliminated) -> tuple[Array, Array]:
-            """Those columns and those of its border, with what the two fronts before took."""
+            """S in those columns and in those of the border, with what the two fronts before took."""
             numbers, pair, places = one
             F = columns(numbers, eliminated)
             rest = jnp.zeros((), F.dtype)

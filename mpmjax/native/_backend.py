@@ -21,7 +21,7 @@ class AbstractBackend(eqx.Module):
     reason: str
     """Why it is this one."""
     name: ClassVar[str]
-    """Its name in MPMJAX_BACKEND and in reports."""
+    """The name in MPMJAX_BACKEND and in reports."""
     platform: ClassVar[str]
     """The platform of JAX, such as cpu."""
     gains_from_order: ClassVar[bool] = False
