@@ -67,7 +67,7 @@ def _correlation(rows: np.ndarray) -> tuple[float, float, float]:
     deviation = np.sqrt(max((changes * (changes - 1) / (count - 1)).sum(), 1.0))
     runs = (changes.sum() - np.count_nonzero(np.diff(rows > 0, axis=0))) / deviation
     # Both are normal of variance one where numbers are independent.
-    if not improbable(max(lags[1] * np.sqrt(count * columns), runs, 0) ** 2 / alike, 1):
+    if not improbable(max(lags[1] * np.sqrt(count * columns), runs, 0) ** 2 / alike, 1.0):
         return alike, 1.0, 1.0
     pair_sums = lags[: count // 2 * 2].reshape(-1, 2).sum(axis=1)
     ends = np.flatnonzero(pair_sums <= 0)
