@@ -1,10 +1,6 @@
 """Walls, grips, mirrored planes and colliders, and the impulses that they receive."""
 
-from mpmjax.boundary._active_set import (
-    ContactInfo as ContactInfo,
-    find_active_set as find_active_set,
-    known_at_start as known_at_start,
-)
+from mpmjax.boundary._active_set import ContactInfo as ContactInfo, find_active_set as find_active_set
 from mpmjax.boundary._body_contact import (
     STIFFNESS as STIFFNESS,
     Body as Body,

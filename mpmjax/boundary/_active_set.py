@@ -24,11 +24,6 @@ class ContactInfo(eqx.Module):
     """Places that pull or are entered all the same."""
 
 
-def known_at_start(nodes: AbstractNodes, explicit: bool) -> bool:
-    """Whether the active set of a step is known at its start: the step is explicit, and so says each contact."""
-    return explicit and all(contact.known_at_start(nodes) for contact in nodes.contacts)
-
-
 def find_active_set(
     nodes: AbstractNodes,
     guess: NodeVector,
@@ -61,7 +56,7 @@ def find_active_set(
     nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, start)
     active = tuple(contact.likely_held(nothing_held, predictor) for contact in nodes.contacts)
     none = jnp.asarray(0, dtype=jnp.int32)
-    if known_at_start(nodes, explicit):
+    if explicit and all(contact.known_at_start(nodes) for contact in nodes.contacts):
         return active, guess, cost, none
     first = (active, guess, cost, jnp.asarray(True), none)
     active, guess, cost, _, count = jax.lax.while_loop(lambda s: s[3] & (s[4] < SWEEPS), sweep, first)

@@ -169,7 +169,7 @@ class PlaneContact(AbstractContact):
 
         Σ m_i (1 − B_i S/M) (v_i − B_i v_b),   S = Σ B m,   M = Σ B² m,
 
-    so that the two conditions exclude each other, and an explicit step needs no sweep. Columns that no particle reaches
+    so that the two conditions exclude each other. Columns that no particle reaches
     whose face is at the wall are not held. Columns that are each other's image in another plane are held together.
     Friction acts on the first node of a column that has a tangential velocity of its own.
     """
@@ -189,8 +189,10 @@ class PlaneContact(AbstractContact):
         return self.walls[0].axis
 
     def known_at_start(self, nodes: AbstractNodes) -> bool:
-        """Where nothing else holds the nodes of a column."""
-        return not nodes.conditions.holds
+        """Where nothing across another axis and no other boundary moves the nodes of a column."""
+        planes = (contact for contact in nodes.contacts if isinstance(contact, PlaneContact))
+        alone = all(plane.axis == self.axis for plane in planes) and not nodes.mirror.images
+        return alone and not nodes.conditions.holds
 
     def images(self, active: Array) -> tuple[WallImage, ...]:
         return tuple(replace(wall, held=active[..., k : k + 1]) for k, wall in enumerate(self.walls))

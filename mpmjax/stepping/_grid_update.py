@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import NodeVector, Scalar
 from mpmjax.autodiff import saved_for_backward, without_derivative
-from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, count_places, find_active_set, known_at_start
+from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, count_places, find_active_set
 from mpmjax.implicit import SolveInfo, no_solve
 from mpmjax.stepping._implicit_integrators import AbstractImplicitIntegrator
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
@@ -100,8 +100,7 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     elastic = None if nodes.f is None else method.elastic_impulse(nodes, motion)
     holding = held.without_spring_impulses(reaction(nodes, solved, elastic))
     velocity, friction = held.friction(solved.velocity, holding)
-    violated = () if known_at_start(nodes, method.is_explicit) else held.violations(solved.velocity, holding)
-    contact = ContactInfo(sweeps, count_places(nodes, *violated))
+    contact = ContactInfo(sweeps, count_places(nodes, *held.violations(solved.velocity, holding)))
     motion = method.with_friction(motion, velocity - motion.velocity)
     return GridUpdate(motion, solved, elastic, cost.followed_by(info), held, friction, contact)
 
