@@ -357,10 +357,10 @@ template <class T>
 void rearrange(const Pool& pool, int64_t batch, const Rearrangement<T>& first);
 
 // The sums for one dimension and kernel. Those of d and d + 1 columns, vectors at the nodes without and with a mass,
-// have code of their own; others are summed in four columns at a time. Gather and pull take particles from a first to a
-// last. Others take all particles, and set the nodes from a first to a last; they pass over blocks whose range of
-// indices says that they give nothing to these. `resist_particles` stores what the particles from a first to a last
-// give.
+// have code of their own, as has a gather of one; others are summed in four columns at a time. Gather and pull take
+// particles from a first to a last. Others take all particles, and set the nodes from a first to a last; they pass over
+// blocks whose range of indices says that they give nothing to these. `resist_particles` stores what the particles from
+// a first to a last give.
 template <class T>
 struct Kernels {
   void (*gather)(const Gather<T>&, int64_t first, int64_t last);
