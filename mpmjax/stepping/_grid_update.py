@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from mpmjax._types import NodeVector, Scalar
 from mpmjax.autodiff import saved_for_backward, without_derivative
 from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, count_places, find_active_set
-from mpmjax.implicit import SolveInfo, no_solve
+from mpmjax.implicit import SolveInfo
 from mpmjax.stepping._implicit_integrators import AbstractImplicitIntegrator
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
@@ -93,8 +93,10 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         return held, motion.velocity, held.without_spring_impulses(missing), motion.carrier, info
 
     start = frozen_method.mean_displacement(frozen, NodeMotion(guess))
+    zero = jnp.zeros((), guess.dtype)
+    none = SolveInfo(residual=zero, report=zero)
     active, guess, cost, sweeps = saved_for_backward(
-        find_active_set(frozen, guess, start, attempt, no_solve(guess.dtype), explicit=method.is_explicit)
+        find_active_set(frozen, guess, start, attempt, none, explicit=method.is_explicit)
     )
     held, motion, solved, info = solve(constrain(nodes, active), method, guess)
     elastic = None if nodes.f is None else method.elastic_impulse(nodes, motion)
