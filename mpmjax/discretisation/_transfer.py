@@ -240,9 +240,10 @@ def g2p(
             raise ValueError(f"{type(transfer).__name__} needs the change of the nodes' velocity: give before.")
         change = after - before
     fields = [field for field in (after, mean, change) if field is not None]
-    values, gradients = gather(stencil, jnp.concatenate(fields, axis=1), saved=True)
-    # one field after the other, each of shape (d, p), and its gradient (d, d, p), the derivative's direction last
-    values, gradients = jnp.split(values, len(fields)), jnp.split(jnp.swapaxes(gradients, 0, 1), len(fields))
+    # Each by itself: what computes has code of its own for as many columns as there are axes. A gradient is (d, d, p),
+    # the derivative's direction last.
+    values, slopes = zip(*(gather(stencil, field, saved=True) for field in fields), strict=True)
+    gradients = [jnp.swapaxes(slope, 0, 1) for slope in slopes]
     affine: list[Matrix | None] = [None] * len(fields)
     if transfer.affine and stencil.is_least_squares:
         affine = [*gradients]
