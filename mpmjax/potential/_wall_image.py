@@ -53,9 +53,13 @@ class WallImage(eqx.Module):
 
     def with_rows(self, field: Array, rows: Array) -> Array:
         """A field with other rows."""
-        blocks, place = self.blocks(field), (self.start, self.axis + 1)
-        blocks = jax.lax.dynamic_update_slice_in_dim(blocks, rows, *place, allow_negative_indices=False)
-        return blocks.reshape(field.shape)
+        blocks, axis, length = self.blocks(field), self.axis + 1, rows.shape[self.axis + 1]
+        # Laid into zeros first: XLA writes a slice over the field in place, of which the rows' own program still reads.
+        laid = jax.lax.dynamic_update_slice_in_dim(
+            jnp.zeros_like(blocks), rows, self.start, axis, allow_negative_indices=False
+        )
+        j = jax.lax.broadcasted_iota(jnp.int32, blocks.shape, axis) - self.start
+        return jnp.where((j >= 0) & (j < length), laid, blocks).reshape(field.shape)
 
     def column(self, rows: Array) -> Array:
         """The sum over the rows of each column, as columns."""
