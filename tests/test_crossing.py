@@ -161,10 +161,10 @@ def test_the_program_for_other_platforms_is_the_same_sum(d, monkeypatch):
     monkeypatch.setenv("MPMJAX_BACKEND", "xla")
     _, stencil, given, nodes = example(d)
     groups, rows = _sums.given_rows(stencil, given[0], given[1:])
-    at, params = (stencil.first, stencil.offset), {"basis": stencil.basis, "groups": groups}
-    loops, kernel = (_sums._gather(*at, nodes, **params, unroll=unroll) for unroll in (False, True))
+    at, params = (stencil.first, stencil.offset, None), {"basis": stencil.basis, "groups": groups}
+    loops, kernel = (_sums.gather_sum.function(*at, nodes, **params, unroll=unroll) for unroll in (False, True))
     jax.tree.map(lambda a, b: assert_close(a, b, 1e-15), loops, kernel)
-    loops, kernel = (_sums._scatter(*at, *rows, **params, size=5**d, unroll=u) for u in (False, True))
+    loops, kernel = (_sums.scatter_sum.function(*at, rows, **params, size=5**d, unroll=u) for u in (False, True))
     assert_close(loops[0], kernel[0], 1e-14)
     traced = jax.jit(lambda given, nodes: (scatter(stencil, given[0], given[1:], 5**d), gather(stencil, nodes)))
     programs = {p: traced.trace(given, nodes).lower(lowering_platforms=(p,)).as_text() for p in ("cpu", "cuda")}

@@ -235,7 +235,8 @@ def test_the_shell_prints_a_warning_in_a_line(tmp_path):
         UserWarning, match=r"36 particles of \[\[particles\]\] 2 lie in the region of \[\[particles\]\] 1"
     ):
         read_scene_file(scene)
-    assert "no [fit] table" in refused("fit", scene)
+    scene.write_text(f"{scene.read_text()}[fit]\n")
+    assert "needs an [[fit.observation]]" in refused("fit", scene)
     told = [line for line in shell("fit", scene)[2].splitlines() if "warning" in line]
     assert [line.split(" particles")[0] for line in told] == [
         "warning: 36",

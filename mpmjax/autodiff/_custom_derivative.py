@@ -248,7 +248,7 @@ def _abstract(*arrays: ShapedArray, call: _Call) -> list[ShapedArray]:
     return [ShapedArray((*batch, *a.shape), a.dtype) for a in jax.tree.leaves(call.results(members))]
 
 
-def _batch(arrays: Sequence[Any], axes: Sequence[Any], *, call: _Call) -> tuple[list[Array], list[int]]:
+def _batch(arrays: Sequence[Any], axes: Sequence[Any], *, call: _Call) -> tuple[list[Array], list[int | None]]:
     if call.function.elementwise:
         return _custom_p.bind(*arrays, call=call), list(axes)
     out = _custom_p.bind(*arrays, call=call._replace(mapped=(*call.mapped, tuple(axes))))

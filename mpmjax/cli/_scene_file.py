@@ -14,7 +14,7 @@ import numpy as np
 
 from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
-from mpmjax.checks import require, require_positive, shortened, warn
+from mpmjax.checks import checked, require, require_positive, shortened, warn
 from mpmjax.geometry import AbstractRegion
 from mpmjax.io import arguments, decode
 from mpmjax.simulation import number_of_steps
@@ -80,6 +80,7 @@ class Simulation(NamedTuple):
         return {"t1": self.t1, "dt": self.dt, "method": self.method, "save_every": self.save_every}
 
 
+@checked
 def load_scene(path: str | os.PathLike) -> tuple[Scene, Particles, dict[str, Any]]:
     """The scene of a TOML file (docs/scene_files.md), its particles, and its `[run]` as arguments of `simulate` and
     `record`:
