@@ -281,8 +281,9 @@ class ContactPlane(AbstractPlane):
     before it. What it moves with when it is first held is lost, so an impact returns less than from a `SeparatingBox`,
     which is the better wall for a bounce.
 
-    *When it breaks*: as a `SymmetryPlane`. PIC and FLIP carry no velocity gradient to the grid, so with
-    them a fast stretch of what touches the wall is taken for leaving it; APIC knows better.
+    *When it breaks*: as a `SymmetryPlane`. PIC and FLIP carry no velocity gradient to the grid, so with them a fast
+    stretch of what touches the wall is taken for leaving it; APIC knows better. Half-way between nodes a plane is not
+    the mirror for cubic kernels: errors at it are four times as large as at one on nodes.
 
     Args:
         axis: direction of the normal, 0 to d − 1.

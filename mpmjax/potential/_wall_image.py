@@ -124,7 +124,7 @@ def wall_image(
     ξ_b ≥ ½ for quadratic kernels. Nodes behind b have its normal velocity times B = ξ/ξ_b, so that it is zero on the
     wall, and fields that are linear across it are in the map: forces of a uniform pressure, which have neither sum nor
     first moment about the wall, vanish. Nodes more than a quarter of a spacing behind the wall have the tangential
-    velocity of b. With the wall on a node or half-way between nodes this is the mirror.
+    velocity of b. With the wall on a node this is the mirror, and half-way between nodes too but for cubic kernels.
 
     Sums over particles are no integrals: by `slope`, the volumes of particles times the gradient's factors along the
     axis, summed at the nodes of the axis [m^(d-1)], shape (m,), the wall is moved by up to 0.02 spacings to where a

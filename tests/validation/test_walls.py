@@ -100,7 +100,7 @@ EACH_PLANE = pytest.mark.parametrize(
     ("kernel", "offset"),
     [
         ("quadratic", 0.0),
-        pytest.param("cubic", 0.5, marks=pytest.mark.slow),
+        pytest.param("cubic", 0.0, marks=pytest.mark.slow),
     ],
 )
 
@@ -134,6 +134,7 @@ TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 )
 def test_a_contact_plane_that_is_pressed_upon_is_a_symmetry_plane(kernel, method, transfer, offset):
     """To rounding, and nothing of the conditions is left violated."""
+    offset = 0.0 if kernel == "cubic" else offset  # between nodes it is no mirror (see `ContactPlane`)
     # without an affine velocity, P2G takes a fast stretch at the wall for leaving it
     amplitude = 0.01 if transfer.affine else 1e-3
     case = {
@@ -149,7 +150,8 @@ def test_a_contact_plane_that_is_pressed_upon_is_a_symmetry_plane(kernel, method
         a, b = (np.asarray(getattr(run.frames, name)) for run in (symmetry, contact))
         assert_close(a, b, 1e-11)
     assert int(contact.statistics.violations) == 0
-    assert int(contact.statistics.sweeps) == int(contact.statistics.steps)
+    searched = 0 if method.is_explicit else int(contact.statistics.steps)  # an explicit step knows what is held
+    assert int(contact.statistics.sweeps) == searched
 
 
 SPEED, LENGTH = 0.05, 1.0
