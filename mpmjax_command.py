@@ -166,7 +166,10 @@ def _(
 @_reporting
 def run(
     scene: ScenePath,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The HDF5 file to write; ParaView opens it.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The HDF5 file to write; ParaView opens it. Default: SCENE.vtkhdf here."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace the output file if it exists.")] = False,
     resume: Annotated[bool, typer.Option(help="Continue the output file from its last frame.")] = False,
     dt: Annotated[str | None, typer.Option(metavar="S", help='Another step [s], "stable" or "auto".')] = None,
@@ -181,6 +184,7 @@ def run(
     """Simulate a scene and write its frames."""
     _require(not (overwrite and resume), "--overwrite starts a file anew and --resume continues it: give one of them.")
     _require(steps is None or t1 is None, "--steps and --t1 both say where the run ends: give one of them.")
+    output = Path(f"{scene.stem}.vtkhdf") if output is None else output
     free = overwrite or resume or not output.exists()
     _require(free, f"{output} exists: choose another name, or give --overwrite or --resume.")
     _require_folder(output)

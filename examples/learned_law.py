@@ -198,7 +198,7 @@ assert SMALL or table["network, trained"][1] < 1.25 * table[best][1]
 
 # %%
 run = mpm.simulate(with_law(bent, law).scene, bent.particles, t1=T1, dt=bent.dt, save_every=8)
-mpm.save("learned_law.h5", run)
+mpm.save("learned_law.vtkhdf", run)
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
 stretch, data = np.linspace(0.7, 1.45, 76), bent.observations[0].data
 F = jnp.stack([jnp.stack([stretch, 0 * stretch]), jnp.stack([0 * stretch, 1 / stretch])])

@@ -47,5 +47,5 @@ print(f"d(width²)/d(stiffening) = {slope:.5g} m², by a difference {difference:
 assert abs(slope / difference - 1) < 0.01
 
 # %%
-mpm.save("tissue.h5", mpm.simulate(scene, thrown, t1=0.05, dt=2.5e-3, method=mpm.SemiImplicit()))
-assert isinstance(mpm.load("tissue.h5").scene.material, SoftTissue)
+mpm.save("tissue.vtkhdf", mpm.simulate(scene, thrown, t1=0.05, dt=2.5e-3, method=mpm.SemiImplicit()))
+assert isinstance(mpm.load("tissue.vtkhdf").scene.material, SoftTissue)

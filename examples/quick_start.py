@@ -16,7 +16,7 @@ scene = mpm.Scene(
     boundary=mpm.SlipBox((0.125, 0.125), (1.375, 1.375)),
 )
 run = mpm.simulate(scene, jelly, t1=0.5, dt=5e-3, method=mpm.SemiImplicit(beta=1.0), save_every=5)
-mpm.save("jelly.h5", run)  # opens in ParaView as it is
+mpm.save("jelly.vtkhdf", run)  # opens in ParaView as it is
 
 
 # %%

@@ -203,7 +203,10 @@ def test_an_example_is_copied_with_its_data(tmp_path, monkeypatch):
     for _ in range(2):  # a copy that is there already is no fault
         code, out, err = shell("example", "rubber")
         assert code == 0, err
-    assert out.splitlines()[-2:] == ["mpmjax fit examples/rubber.toml", "mpmjax run examples/rubber.toml -o rubber.h5"]
+    assert out.splitlines()[-2:] == [
+        "mpmjax fit examples/rubber.toml",
+        "mpmjax run examples/rubber.toml -o rubber.vtkhdf",
+    ]
     assert read_fit(tmp_path / "examples/rubber.toml").experiments
     with open("examples/rubber.toml", "a") as file:
         file.write("# mine")
@@ -238,6 +241,14 @@ def test_run_does_not_replace_a_file_unasked_and_resumes_it(folder):
     assert "give one of them" in refused("run", longer, "-o", copy, "--resume", "--overwrite")
     assert shell("run", longer, "-o", copy, "--resume", "--quiet")[0] == 0
     np.testing.assert_array_equal(mpm.load(copy).steps, [0, 2, 4, 6, 8])
+
+
+def test_the_file_is_named_after_the_scene(folder, tmp_path, monkeypatch):
+    """It is the one that is resumed, too."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.vtkhdf").write_bytes((folder / "run.h5").read_bytes())
+    assert shell("run", folder / "scene.toml", "--resume", "--quiet")[0] == 0
+    assert "scene.vtkhdf exists" in refused("run", folder / "scene.toml")
 
 
 def test_a_complete_run_is_resumed_with_success(folder, tmp_path):

@@ -164,7 +164,7 @@ def test_the_learned_law_fits_and_generalises(example):
 
 @pytest.mark.slow
 def test_the_learned_law_is_saved_and_loaded(example):
-    run = mpm.load(example["folder"] / "learned_law.h5")
+    run = mpm.load(example["folder"] / "learned_law.vtkhdf")
     law = run.scene.material
     F = deformations(2)
     np.testing.assert_array_equal(law.energy(F), example["law"].energy(F))

@@ -336,4 +336,4 @@ def test_the_example_runs(tmp_path):
     script = [sys.executable, str(ROOT / "examples" / "own_law.py")]
     ran = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
-    assert (tmp_path / "tissue.h5").exists()
+    assert (tmp_path / "tissue.vtkhdf").exists()
