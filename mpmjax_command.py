@@ -288,8 +288,8 @@ def render(
     colour: Annotated[
         str,
         typer.Option(
-            help="What colours the particles: speed, volume, energy, pressure, von_mises, density, none, or what a law "
-            "remembers."
+            help="What colours the particles: speed, J, energy, pressure, von_mises, density, material, mass, volume, "
+            "particle, none, or what a law remembers."
         ),
     ] = "speed",
     frame: Annotated[int | None, typer.Option(help="The frame of a still; negative from the end.")] = None,

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import equinox as eqx
+import h5py
 import jax
 import numpy as np
 import pytest
@@ -43,6 +44,9 @@ upper = [0.6, inf]
 region = { kind = "Box", lower = [0.0, 0.1], upper = [0.3, 0.4] }
 density = 1e3
 
+[output]
+fields = ["stress", "particle"]
+
 [run]
 t1 = 0.06
 dt = 1e-2
@@ -74,6 +78,9 @@ def test_summary_says_how_many_steps_were_indefinite(folder):
 def test_run_writes_the_frames_and_a_summary(folder):
     run = mpm.load(folder / "run.h5")
     np.testing.assert_array_equal(run.steps, [0, 2, 4, 6])
+    with h5py.File(folder / "run.h5") as file:  # with the fields that its scene asks for
+        assert {"stress", "particle"} <= set(file["VTKHDF/PointData"])
+        assert "pressure" not in file["VTKHDF/PointData"]
     summary = (folder / "summary").read_text()
     assert re.search(r"steps +6 of 0.01 s with SemiImplicit", summary)
     for word in ("particle-steps per second", "iterations a step", "total energy", "mass"):
@@ -364,6 +371,7 @@ BAD_SCENES = {
     "missing table": ("[run]", "[rum]", r"\[run\]"),
     "automatic method, given step": ('method = { kind = "SemiImplicit" }', 'method = "auto"', r'goes with dt = "auto"'),
     "no time for pilot runs": ("dt = 1e-2", 'dt = "auto"\nmost_seconds = 0', r"\[run\] most_seconds"),
+    "unknown field": ('"stress"', '"strain"', r"\[output\] fields must be some of .*, got 'strain'"),
     "no step": ("dt = 1e-2", "", r"\[run\] needs the key 'dt'"),
     "a step in words": ("dt = 1e-2", 'dt = "small"', r'"stable" or "auto", got \'small\''),
     "counts": ("density = 1e3", "density = 1e3\nparticles_per_cell = 3", r"\[\[particles\]\] 1.*2-th power"),

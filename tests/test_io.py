@@ -16,9 +16,12 @@ from disk import full_beyond
 from helpers import DESCRIPTIONS, TRANSFERS, block, cloud, ids, thorough
 
 import mpmjax as mpm
+import mpmjax.io._frame_writer
 import mpmjax.io._run_file
 import mpmjax.io._runs
-from mpmjax.io._runs import FrameWriter, load, record, save
+from mpmjax.analysis import FIELDS, density, fields_of, pressure, von_mises
+from mpmjax.io._frame_writer import FrameWriter
+from mpmjax.io._runs import load, record, save
 from mpmjax.io._transactional_file import StagedFile, undisturbed
 from mpmjax.simulation._diffrax import Problem, RolloutState, initial_state
 from mpmjax.simulation._run import Run, RunStatistics, no_steps
@@ -153,7 +156,7 @@ def test_saving_is_all_or_nothing(tmp_path, monkeypatch):
     """A save that fails on the way leaves the file that was there, and no litter."""
     path, run = tmp_path / "run.h5", made_up(2)
     save(path, run)
-    monkeypatch.setattr(mpmjax.io._runs, "set_count", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    monkeypatch.setattr(mpmjax.io._frame_writer, "set_count", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match=r"frame 0 could not be written \(disk full\)"):
         save(path, eqx.tree_at(lambda r: r.dt, run, jnp.asarray(2e-3)))
     assert_same(load(path), run)
@@ -185,6 +188,9 @@ def test_the_file_has_the_layout_that_vtk_reads(d, dtype, tmp_path):
             "PointData/velocity": np.pad(v, ((0, 0), (0, 3 - d))),
             "PointData/deformation_gradient": full.reshape(-1, 9),
             "PointData/affine_velocity": affine.reshape(-1, 9),
+            "PointData/pressure": np.concatenate([pressure(run.scene, run.frame(i)) for i in range(n)]),
+            "PointData/von_mises": np.concatenate([von_mises(run.scene, run.frame(i)) for i in range(n)]),
+            "PointData/material": np.ones(n * p),
             "PointData/J": F[:, 0, 0] if d == 1 else np.linalg.det(F),
             "Vertices/NumberOfCells": [p],
             "Vertices/NumberOfConnectivityIds": [p],
@@ -197,7 +203,7 @@ def test_the_file_has_the_layout_that_vtk_reads(d, dtype, tmp_path):
             "Steps/CellOffsets": np.zeros((n, 4)),
             "Steps/ConnectivityIdOffsets": np.zeros((n, 4)),
         }
-        for name in ("velocity", "deformation_gradient", "affine_velocity", "J"):
+        for name in ("velocity", "deformation_gradient", "affine_velocity", "J", "pressure", "von_mises", "material"):
             wanted[f"Steps/PointDataOffsets/{name}"] = [0, p, 2 * p]
         for name in ("Lines", "Polygons", "Strips"):
             wanted |= {f"{name}/NumberOfCells": [0], f"{name}/NumberOfConnectivityIds": [0]}
@@ -209,7 +215,8 @@ def test_the_file_has_the_layout_that_vtk_reads(d, dtype, tmp_path):
             assert np.array_equal(found[name][...], value), name
             assert (found[name].fletcher32, found[name].compression) == (True, "gzip"), name
             real = name == "Points" or name.startswith("PointData")
-            assert found[name].dtype == (dtype if real else np.float64 if name == "Steps/Values" else np.int64), name
+            kinds = {"Steps/Values": np.float64, "PointData/material": np.int32}
+            assert found[name].dtype == kinds.get(name, dtype if real else np.int64), name
         assert vtk["Steps"].attrs["NSteps"] == n
         assert vtk["Steps"].attrs["NSteps"].dtype == np.int64
 
@@ -240,6 +247,36 @@ def test_vtk_reads_every_step_and_array(d, tmp_path):
             assert set(read) == set(vtk["PointData"])
             for name, values in read.items():
                 assert np.array_equal(values, vtk["PointData"][name][rows]), name
+
+
+def test_fields_are_those_that_were_asked_for(tmp_path):
+    """Each frame's own, whoever wrote it: `record`, a resumed one, which keeps the file's, or `save`."""
+    (scene, particles), kwargs = jelly(), {"dt": 5e-3, "save_every": 2}
+    path, other = tmp_path / "run.vtkhdf", tmp_path / "saved.vtkhdf"
+    record(path, scene, particles, t1=0.02, fields=list(FIELDS), **kwargs)
+    record(path, scene, particles, t1=0.03, resume=True, **kwargs)
+    run = load(path)
+    save(other, run, fields=("density", "stress"))
+    p = run.final.count
+    with h5py.File(path) as recorded, h5py.File(other) as saved:
+        for i in range(len(run)):
+            rows, frame = slice(i * p, (i + 1) * p), run.frame(i)
+            for name, field in fields_of(run.scene, frame, tuple(FIELDS)).items():
+                assert np.array_equal(
+                    recorded["VTKHDF/PointData"][name][rows], np.reshape(field, (p, *[9] * (field.ndim == 3)))
+                )
+            np.testing.assert_allclose(saved["VTKHDF/PointData/density"][rows], density(run.scene, frame), rtol=1e-12)
+            np.testing.assert_allclose(
+                saved["VTKHDF/PointData/stress"][rows],
+                mpm.stress(run.scene, frame).reshape(p, 9),
+                rtol=1e-12,
+                atol=1e-9,
+            )
+        states = {"velocity", "J", "deformation_gradient", "affine_velocity"}
+        assert set(saved["VTKHDF/PointData"]) == states | {"density", "stress"}
+    with pytest.raises(ValueError, match=r"fields must be some of speed, .* particle, got 'presure'"):
+        save(other, run, fields=("presure",))
+    assert_same(load(other), run)
 
 
 def test_the_file_says_what_it_holds(tmp_path):
@@ -338,7 +375,7 @@ def test_an_interrupt_leaves_complete_frames_and_can_be_resumed(tmp_path, monkey
     path, (scene, particles) = tmp_path / "run.h5", jelly()
     kwargs = {"dt": 5e-3, "save_every": 4}
     single = mpm.simulate(scene, particles, t1=0.07, **kwargs)
-    set_count, calls = mpmjax.io._runs.set_count, []
+    set_count, calls = mpmjax.io._frame_writer.set_count, []
 
     def interrupted(file, count):
         calls.append(count)
@@ -347,7 +384,7 @@ def test_an_interrupt_leaves_complete_frames_and_can_be_resumed(tmp_path, monkey
         set_count(file, count)
 
     with monkeypatch.context() as patch:
-        patch.setattr(mpmjax.io._runs, "set_count", interrupted)
+        patch.setattr(mpmjax.io._frame_writer, "set_count", interrupted)
         with pytest.raises(KeyboardInterrupt):
             record(path, scene, particles, t1=0.07, **kwargs)
     assert calls == [1, 2, 3]

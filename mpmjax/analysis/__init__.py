@@ -17,7 +17,9 @@ from mpmjax.analysis._budget import (
 )
 from mpmjax.analysis._sensitivity import Sensitivity as Sensitivity, sensitivity as sensitivity
 from mpmjax.analysis._stress import (
+    FIELDS as FIELDS,
     density as density,
+    fields_of as fields_of,
     pressure as pressure,
     smoothed as smoothed,
     stress as stress,

@@ -1,10 +1,14 @@
 """Stress and density of particles, and the numbers that are plotted of them."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, ParticleScalar, components
+from mpmjax.analysis._budget import energy_density
 from mpmjax.checks import canonical, checked
 from mpmjax.discretisation import gather, scatter
 from mpmjax.state import Particles, Scene, prepare, velocity_gradient
@@ -57,6 +61,28 @@ def smoothed(scene: Scene, particles: Particles, values: ParticleScalar) -> Part
     filled = sums[:, 1] > 0
     nodes = jnp.where(filled, sums[:, 0] / jnp.where(filled, sums[:, 1], 1), 0)
     return gather(stencil, nodes[:, None])[0][0]
+
+
+FIELDS: dict[str, tuple[str, Callable[[Scene, Particles], Array]]] = {
+    "speed": ("speed [m/s]", lambda scene, q: jnp.linalg.norm(q.v, axis=1)),
+    "energy": ("elastic energy density [J/m^d]", energy_density),
+    "stress": ("Cauchy stress [Pa]", stress),
+    "pressure": ("pressure [Pa]", pressure),
+    "von_mises": ("von Mises stress [Pa]", von_mises),
+    "density": ("density [kg/m^d]", density),
+    "material": ("material", lambda scene, q: jnp.asarray(np.repeat(1 + np.arange(len(q.sizes)), q.sizes), "int32")),
+    "mass": ("mass [kg]", lambda scene, q: q.mass),
+    "volume": ("undeformed volume [m^d]", lambda scene, q: q.volume),
+    "particle": ("particle", lambda scene, q: jnp.arange(q.count, dtype="int32")),
+}
+"""The numbers of each prepared particle beside its state: a label, and an array with a row a particle.
+Materials are numbered from 1, as in scene files, particles from 0."""
+
+
+@eqx.filter_jit
+def fields_of(scene: Scene, particles: Particles, names: tuple[str, ...]) -> dict[str, Array]:
+    """Some of `FIELDS`, by one compiled program."""
+    return {name: FIELDS[name][1](scene, particles) for name in names}
 
 
 @eqx.filter_jit

@@ -26,7 +26,7 @@ from mpmjax.fitting import (
     predict_observations,
     profile,
 )
-from mpmjax.io import check_place, load, record, reporting, steps_in, stopping
+from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, reporting, steps_in, stopping
 from mpmjax.native import backend
 from mpmjax.simulation import Problem, Run, initial_state, no_steps, run_to
 from mpmjax.state import Particles
@@ -55,6 +55,7 @@ def run_scene(
         simulation.scene,
         simulation.particles,
         **simulation.settings,
+        **simulation.output,
         overwrite=overwrite,
         resume=resume,
         progress=not quiet,
@@ -272,9 +273,10 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
         used = stepped.memory_analysis()
         if used is not None:
             say("memory", f"{_bytes(used.temp_size_in_bytes + used.argument_size_in_bytes)} in a step")
-        numbers = 16 + 9 * (particles.C is not None)  # of x, v, J, F and C in a frame
+        fields = file.output.get("fields", FIELDS_WRITTEN)
+        numbers = 16 + 9 * (particles.C is not None) + len(fields) + 8 * ("stress" in fields)  # 16 of x, v, J and F
         frames = run.t1 / dt / (run.save_every or 1) + 1
-        say("file", f"about {_bytes(frames * particles.count * numbers * particles.x.dtype.itemsize)}")
+        say("file", f"at most {_bytes(frames * particles.count * numbers * particles.x.dtype.itemsize)}")
         if dt > bound:
             warn(f"the step is {dt / bound:.3g} times the longest stable one: the run is likely to blow up.")
         if not np.asarray(after.v).any():

@@ -16,7 +16,7 @@ from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
 from mpmjax.checks import checked, require, require_positive, shortened, warn
 from mpmjax.geometry import AbstractRegion
-from mpmjax.io import arguments, decode
+from mpmjax.io import arguments, check_fields, decode, save
 from mpmjax.simulation import number_of_steps
 from mpmjax.state import Particles, Scene, attach, fill, join, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
@@ -57,6 +57,7 @@ class SceneFile(NamedTuple):
     scene: Scene
     particles: Particles
     run: RunSettings
+    output: dict[str, Any]
     fit: dict[str, Any] | None
     build: Build
 
@@ -70,6 +71,7 @@ class Simulation(NamedTuple):
     dt: float
     method: AbstractIntegrator
     save_every: int
+    output: dict[str, Any]  # the `[output]` table, as arguments of `record` and `save`
     fit: dict[str, Any] | None  # the `[fit]` table, not read yet; None without one
     choice: str | None  # the choice for "auto" or "stable", and why; None if there was none
     build: Build  # makes the scene and its particles on n times as many cells a direction, from n
@@ -107,7 +109,7 @@ def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
     table = scene_table(path, changes)
     fit_table = table.pop("fit", None)
     require(fit_table is None or isinstance(fit_table, dict), f"{path}: [fit] must be a table.")
-    groups, run_table = table.pop("particles"), table.pop("run")
+    groups, run_table, output_table = table.pop("particles"), table.pop("run"), table.pop("output", {})
     groups = groups if isinstance(groups, list) else [groups]
     try:
         require(isinstance(run_table, dict), f"[run] must be a table, got {shortened(repr(run_table))}.")
@@ -118,6 +120,8 @@ def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
         settings: dict[str, Any] = {} if "method" in auto else {"method": Explicit()}
         settings |= arguments(RunSettings, {k: v for k, v in run_table.items() if k not in auto}, "[run]")
         run = RunSettings(**settings)
+        output = arguments(save, output_table, "[output]", without=("path", "run"))
+        check_fields(output.get("fields", ()), "[output] fields")
 
         def build(n: int) -> tuple[Scene, Particles]:
             scene = decode(_refined(table, n), Scene)
@@ -132,7 +136,7 @@ def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
         raise ValueError(f"{path}: {error}") from None
     except RecursionError:
         raise ValueError(f"{path}: tables are nested too deeply to be read.") from None
-    return SceneFile(scene, particles, run, fit_table, build)
+    return SceneFile(scene, particles, run, output, fit_table, build)
 
 
 def read_simulation(
@@ -174,7 +178,10 @@ def read_simulation(
             raise ValueError(f"{path}: {choice}")
         dt, method = best.dt, best.method
         save_every = save_every or max(1, best.steps // _FRAMES)
-    return Simulation(file.scene, file.particles, t1, float(dt), method, save_every or 1, file.fit, choice, file.build)
+    every = save_every or 1
+    return Simulation(
+        file.scene, file.particles, t1, float(dt), method, every, file.output, file.fit, choice, file.build
+    )
 
 
 def stable_step(path: Path, file: SceneFile) -> float:

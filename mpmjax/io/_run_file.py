@@ -4,8 +4,9 @@ ParaView reads them; and its description, all that is not frames.
 Frames are VTK's layout of moving particles in HDF5, temporal PolyData. They lie end to end in Points and PointData, and
 `Steps` says where each begins; the topology, a vertex a particle, is there once for all of them. Numbers keep the run's
 dtype. In one and two dimensions vectors are padded with zeros and deformation gradients with the identity; where a law
-knows J alone, J^(1/d) I stands for F. What laws remember is a dataset a name, NaN at the particles of other laws. Every
-dataset is compressed and carries checksums, and a chunk holds one frame, so that writing a frame touches no other.
+knows J alone, J^(1/d) I stands for F. What laws remember is a dataset a name, NaN at the particles of others; fields
+that were asked for are there for plots. Every dataset is compressed and carries checksums, and a chunk holds one frame,
+so that writing a frame touches no other.
 """
 
 import json
@@ -276,8 +277,9 @@ def created(staged: StagedFile, path: Path, described: dict[str, Any], rows: dic
     return file
 
 
-def rows_of(frame: int, time: float, state: State) -> dict[str, np.ndarray]:
-    """The rows that a state adds to each dataset, as a frame with this number and time [s]."""
+def rows_of(frame: int, time: float, state: State, fields: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The rows that a state and fields of it add to each dataset, as a frame with this number and time [s]. What a law
+    remembers comes before a field of its name, since a restart needs it."""
     x, v = np.asarray(state.x), np.asarray(state.v)
     p, d = x.shape
     flat = ((0, 0), (0, 3 - d))
@@ -292,6 +294,8 @@ def rows_of(frame: int, time: float, state: State) -> dict[str, np.ndarray]:
         data["affine_velocity"] = _padded(np.asarray(state.C), 0.0)
     for name, rows, leaf in history_arrays(state):
         data.setdefault(name, np.full(p, np.nan, x.dtype))[rows] = leaf
+    for name, field in fields.items():
+        data.setdefault(name, np.asarray(field).reshape(p, *[9] * (field.ndim == 3)))
     first = frame * p
     steps = {"PartOffsets": 0, "NumberOfParts": 1, "PointOffsets": first}  # the one part, read anew at each step
     steps |= {f"PointDataOffsets/{name}": first for name in data}

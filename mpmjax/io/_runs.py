@@ -1,7 +1,7 @@
 """Runs in files: HDF5 that ParaView opens as it is, and from which a run continues bit for bit.
 
     /VTKHDF     the frames (see `_run_file`): Points, and as PointData velocity, deformation_gradient, J = det F,
-                with APIC affine_velocity, and what laws that yield remember
+                with APIC affine_velocity, what laws that yield remember, and fields such as the pressure
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
                 `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
                 up to it; `collider_impulse` and `boundary_impulse`, those on each by then, linear, then angular;
@@ -16,12 +16,9 @@ A file is read only if it holds all of its data itself: HDF5 follows links to ot
 
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import fields
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 import equinox as eqx
@@ -31,29 +28,18 @@ import numpy as np
 from tqdm import tqdm
 
 from mpmjax._types import Scalar
-from mpmjax.boundary import Impulses
 from mpmjax.checks import canonical, checked, is_traced, require, require_memory, require_whole, requirements, warn
+from mpmjax.io._frame_writer import FIELDS_WRITTEN, FrameWriter, at, check_fields, frames_in, new_writer
 from mpmjax.io._run_file import (
-    File,
-    check_hdf5,
     check_numbers,
     check_place,
-    check_same,
-    checksum,
     count_in,
-    created,
-    describe,
     description_in,
-    frame_rows,
-    opened,
     reading,
     require_of_file,
-    rows_of,
-    set_count,
-    states_in,
 )
 from mpmjax.io._schema import decode
-from mpmjax.io._transactional_file import StagedFile, reason, replacing, reporting, undisturbed
+from mpmjax.io._transactional_file import reporting
 from mpmjax.simulation import (
     Fault,
     Problem,
@@ -62,7 +48,6 @@ from mpmjax.simulation import (
     RunStatistics,
     SimulationError,
     initial_state,
-    no_steps,
     number_of_steps,
     raise_faults,
     run_to,
@@ -72,131 +57,7 @@ from mpmjax.simulation import (
 from mpmjax.state import Particles, Scene, prepare, state_of
 from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
 
-_IMPULSES = ("collider_impulse", "boundary_impulse")
-
-
-class FrameWriter:
-    """Writes a run a frame at a time. What is written has left the program when `append` returns. A context manager:
-    leaving it closes the file. `create` and `resume` make one."""
-
-    def __init__(self, file: File, staged: StagedFile, path: Path, like: RolloutState):
-        self._file, self._staged, self._path, self._like = file, staged, path, like
-        self._kept = self._standing()
-
-    @classmethod
-    def create(cls, path: str | os.PathLike, run: Problem, *, start: int = 0, overwrite: bool = False) -> "FrameWriter":
-        """Begin a file with a run's prepared particles as its first frame, of step `start`. It takes its place when
-        that is on the disk; whatever is wrong before leaves what was there."""
-        path = Path(path)
-        check_place(path, overwrite=overwrite)
-        with undisturbed():
-            with _new(path, run) as writer:
-                writer.append(start, initial_state(run.scene, run.particles), no_steps(run.particles.x.dtype))
-            return cls.resume(path, run)
-
-    @classmethod
-    def resume(cls, path: str | os.PathLike, run: Problem) -> "FrameWriter":
-        """Open a file to append frames to it, after checking that it is whole, of the same run, and not being
-        written. Frames that a killed writer left incomplete are cut off."""
-        path = Path(path)
-        described, begin, rows = _first(run)
-        check_hdf5(path)
-        staged = StagedFile(path)
-        try:
-            with reading(path) as file:
-                for i in range(count_in(file)):
-                    frame_rows(file, i, i + 1)
-                check_same(path, described, description_in(file["mpmjax"]))
-                require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
-            file = opened(staged, path)
-            count = count_in(file)
-            if any(len(file[name]) != count * len(data) for name, data in rows.items()):
-                for name, data in rows.items():
-                    file[name].resize(count * len(data), axis=0)
-                file.flush()
-                staged.commit()
-        except BaseException as error:
-            staged.close()
-            if isinstance(error, OSError):
-                raise OSError(f"{path} could not be written ({reason(error)}); it is as it was.") from None
-            raise
-        return cls(file, staged, path, begin)
-
-    def append(self, step: int, state: RolloutState, statistics: RunStatistics) -> None:
-        """Write the frame of a step, with impulses and statistics by then; one of the last frame's step replaces it.
-        If the disk refuses, an OSError: the file is what it was, and this writer can only be closed."""
-        file, n = self._file, count_in(self._file)
-        if n and file["mpmjax/frames"][n - 1]["step"] == step:
-            n -= 1
-        try:
-            for name, rows in _rows(n, step, file["mpmjax"].attrs["dt"], state, statistics).items():
-                file[name].resize((n + 1) * len(rows), axis=0)
-                file[name][n * len(rows) :] = rows
-            file.flush()
-            self._staged.commit()
-            set_count(file, n + 1)
-            file.flush()
-            kept = self._standing()
-            with undisturbed():  # a signal is told of this frame or of the one before it, as the file is then
-                self._staged.commit()
-                self._kept = kept
-        except (OSError, RuntimeError) as error:
-            raise OSError(f"frame {n} could not be written ({reason(error)})") from None
-        if not self._staged.is_at(self._path):
-            raise OSError(f"frame {n} has no file")
-
-    def last(self) -> tuple[int, RolloutState, RunStatistics]:
-        """Step number, state and statistics of the last frame."""
-        n = count_in(self._file)
-        steps, states, tallies = _frames(self._file, self._like, n - 1, n)
-        return int(steps[0]), *_at((states, tallies), 0)
-
-    def standing(self, then: str) -> str:
-        """A sentence on what the file holds, and then what to do. It reads nothing, so that any thread may call it at
-        any time."""
-        if not self._staged.is_at(self._path):
-            return f"{self._path} was removed or replaced while it was written: run the simulation again."
-        frames, step, time = self._kept
-        held = f"{frames} frame{'s' * (frames > 1)}, the last of step {step} (t = {time:.6g} s)"
-        return f"{self._path} holds {held}. {then}"
-
-    def _standing(self) -> tuple[int, int, float]:
-        """The number of frames, and the last one's step and time [s]."""
-        n = count_in(self._file)
-        step = int(self._file["mpmjax/frames"][n - 1]["step"]) if n else 0
-        return n, step, step * float(self._file["mpmjax"].attrs["dt"])
-
-    def close(self) -> None:
-        """Close the file; an OSError if what was written cannot be brought to the disk."""
-        with suppress(OSError, RuntimeError):  # of a writer that failed; what it has not committed is dropped
-            self._file.close()
-        try:
-            self._staged.sync()
-        except OSError as error:
-            raise OSError(f"{self._path} may not be whole on the disk ({reason(error)}): check it.") from None
-        finally:
-            self._staged.close()
-
-    def __enter__(self) -> "FrameWriter":
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        there = self._staged.is_at(self._path)
-        self.close()
-        if kind is None and not there:
-            raise OSError(self.standing(""))
-
-
-@contextmanager
-def _new(path: Path, run: Problem) -> Iterator[FrameWriter]:
-    """A writer of a new file, without frames, which is at `path` when the block has ended without an error."""
-    described, begin, rows = _first(run)
-    with replacing(path) as aside, StagedFile(aside) as staged:
-        file = created(staged, path, described, rows)
-        file.flush()
-        staged.commit()
-        with FrameWriter(file, staged, aside, begin) as writer:
-            yield writer
+_merged = eqx.filter_jit(RunStatistics.merged)
 
 
 @checked
@@ -209,6 +70,7 @@ def record(
     dt: Scalar | Literal["stable"],
     method: AbstractIntegrator = Explicit(),
     save_every: int,
+    fields: tuple[str, ...] | list[str] = FIELDS_WRITTEN,
     start: int = 0,
     overwrite: bool = False,
     resume: bool = False,
@@ -225,6 +87,9 @@ def record(
         scene, t1, dt, method: as in `simulate`.
         particles: the particles at step `start`; when resuming, those the recorded run began with.
         save_every: write a frame at the start, every so many steps, and at the end.
+        fields: what each frame has beside the state, for those who plot it: any of "pressure", "von_mises", "stress"
+            (Cauchy) [Pa], "density" [kg/m^d], "energy" [J/m^d], "speed" [m/s], "material" (from 1), "mass" [kg],
+            "volume" [m^d] and "particle" (from 0). A file that is resumed keeps those it has.
         start: number of the first step. Not used when resuming.
         overwrite: replace a file that is there.
         resume: continue from the last frame in the file up to t1. Where that is reached already, nothing is done.
@@ -240,6 +105,7 @@ def record(
     """
     start = 0 if resume else require_whole("start", start, 0)
     requirements(method)
+    check_fields(fields)
     particles = prepare(scene, particles)
     dt = step_for(scene, particles, t1, dt, method, start)
     end = start + number_of_steps(t1, dt, start, particles.x.dtype)
@@ -249,7 +115,7 @@ def record(
     if resume:
         writer = FrameWriter.resume(path, problem)
     else:
-        writer = FrameWriter.create(path, problem, start=start, overwrite=overwrite)
+        writer = FrameWriter.create(path, problem, fields, start=start, overwrite=overwrite)
     with writer:
         step, state, statistics = writer.last()
         start = step - int(statistics.steps)
@@ -299,8 +165,9 @@ def record(
 
 
 @checked
-def save(path: str | os.PathLike, run: Run) -> None:
-    """Save a run's frames (without frames, its final state as the one frame) with all that a restart needs.
+def save(path: str | os.PathLike, run: Run, *, fields: tuple[str, ...] | list[str] = FIELDS_WRITTEN) -> None:
+    """Save a run's frames (without frames, its final state as the one frame) with all that a restart needs, and
+    fields for those who plot them (see `record`).
 
     The file is written aside, synced and renamed: at every moment `path` is either what it was or the whole run.
     Observations are not saved. Of the statistics only the last frame's is known; the others are −1.
@@ -311,18 +178,19 @@ def save(path: str | os.PathLike, run: Run) -> None:
         OSError: the disk refused.
     """
     path = Path(path)
+    check_fields(fields)
     check_place(path, overwrite=True)
     require(not is_traced(run), "A run inside a jax transformation has no values yet: save it outside.")
     require(run.final.x.ndim == 2, "Save a batch of runs one by one: jax.tree.map(lambda a: a[i], run).")
     final_step = int(run.final_step)
     count = int((np.asarray(run.steps) < final_step).sum())  # beyond it lie frames of a run that met a fault
-    steps, frames = _at((run.steps, run.frames), slice(count))
+    steps, frames = at((run.steps, run.frames), slice(count))
     states = (state_of(run.final),) if frames is None else (frames, state_of(run.final))
     check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
     unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.statistics)
-    with _new(path, Problem(run.scene, run.final, run.dt, run.method)) as writer:
+    with new_writer(path, Problem(run.scene, run.final, run.dt, run.method), fields) as writer:
         for i in range(count):
-            frame = _at((frames, run.collider_impulse, run.boundary_impulse), i)
+            frame = at((frames, run.collider_impulse, run.boundary_impulse), i)
             writer.append(int(steps[i]), RolloutState(*frame), unknown)
         received = run.final_collider_impulse, run.final_boundary_impulse
         writer.append(final_step, RolloutState(state_of(run.final), *received), run.statistics)
@@ -354,9 +222,9 @@ def load(path: str | os.PathLike) -> Run:
         blank = jax.device_put(np.zeros((len(parts["mass"]), scene.grid.dim), dtype))
         particles = Particles(blank, blank, **parts, counts=described["counts"])
         like = jax.eval_shape(lambda: initial_state(scene, prepare(scene, particles)))
-        steps, frames, tallies = _frames(file, like, 0, count_in(file))
+        steps, frames, tallies = frames_in(file, like, 0, count_in(file))
         check_numbers(scene, described["dt"], steps, frames.particles)
-    last, statistics = _at((frames, tallies), -1)
+    last, statistics = at((frames, tallies), -1)
     return run_to(
         Problem(scene, particles, canonical(described["dt"], dtype), method),
         last,
@@ -370,40 +238,3 @@ def load(path: str | os.PathLike) -> Run:
 
 
 _merged = eqx.filter_jit(RunStatistics.merged)
-
-
-def _at(tree: Any, index: int | slice) -> Any:
-    """The entries of arrays along their first axis. NumPy takes them: each operation of JAX by itself is a program to
-    compile."""
-    return jax.tree.map(lambda a: jax.device_put(np.asarray(a)[index]), tree)
-
-
-def _first(run: Problem) -> tuple[dict[str, Any], RolloutState, dict[str, np.ndarray]]:
-    """A run's description, its state at the start, and the rows of a frame of it."""
-    described, begin = describe(run), initial_state(run.scene, run.particles)
-    return described, begin, _rows(0, 0, described["dt"], begin, no_steps(run.particles.x.dtype))
-
-
-def _rows(frame: int, step: int, dt: Any, state: RolloutState, statistics: RunStatistics) -> dict[str, np.ndarray]:
-    """The rows that a frame adds to each dataset."""
-    values = {"step": np.int64(step)} | {f.name: np.asarray(getattr(statistics, f.name)) for f in fields(RunStatistics)}
-    row = np.array([tuple(values.values())], [(name, a.dtype) for name, a in values.items()])
-    rows = rows_of(frame, step * float(dt), state.particles) | {"mpmjax/frames": row}
-    for name in _IMPULSES:
-        if (both := getattr(state, name)) is not None:
-            rows[f"mpmjax/{name}"] = np.concatenate([np.asarray(both.impulse), np.asarray(both.angular)], axis=1)[None]
-    return rows | {"mpmjax/checksums": np.array([checksum(rows)], np.uint32)}
-
-
-def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.ndarray, RolloutState, RunStatistics]:
-    """Step numbers, states and statistics of frames `start` to `stop`, each with a leading axis; of `like` only shapes
-    count."""
-    rows = frame_rows(file, start, stop)
-    table = rows["mpmjax/frames"]
-    tallies = RunStatistics(**jax.device_put({f.name: table[f.name] for f in fields(RunStatistics)}))
-    received: dict[str, Any] = {}
-    for name in _IMPULSES:
-        if getattr(like, name) is not None:
-            both = np.split(rows[f"mpmjax/{name}"], [like.particles.x.shape[1]], axis=-1)
-            received[name] = Impulses(*jax.device_put(both))
-    return table["step"], RolloutState(states_in(rows, like.particles), **received), tallies

@@ -10,21 +10,18 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax.analysis import WorkPrecision, density, energy_density, name_of, pressure, smoothed, volume_ratio, von_mises
+from mpmjax.analysis import FIELDS, WorkPrecision, name_of, smoothed, volume_ratio
 from mpmjax.checks import canonical, checked, require, require_between, require_memory
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene, by_material, history_arrays
 
-COLOURS: dict[str, tuple[str, Callable[[Run, Particles], Any]]] = {
-    "speed": ("speed [m/s]", lambda run, q: np.linalg.norm(q.v, axis=1)),
-    "volume": ("volume ratio J [-]", lambda run, q: volume_ratio(q)),
-    "energy": ("elastic energy density [J/m³]", lambda run, q: energy_density(run.scene, q)),
-    "pressure": ("pressure [Pa]", lambda run, q: smoothed(run.scene, q, pressure(run.scene, q))),
-    "von_mises": ("von Mises stress [Pa]", lambda run, q: smoothed(run.scene, q, von_mises(run.scene, q))),
-    "density": ("density [kg/m^d]", lambda run, q: density(run.scene, q)),
+COLOURS: dict[str, tuple[str, Callable[[Scene, Particles], Any]]] = {
+    **{name: field for name, field in FIELDS.items() if name != "stress"},
+    "J": ("volume ratio J [-]", lambda scene, q: volume_ratio(q)),
 }
 """The quantities that can colour particles: a label, and a value for each particle."""
+_SMOOTHED = ("pressure", "von_mises")  # they oscillate from particle to particle
 
 SNOW, OCHRE, STEEL, MOSS = (0.91, 0.93, 0.96), (0.82, 0.55, 0.33), (0.36, 0.5, 0.66), (0.45, 0.62, 0.42)
 STONE = (0.55, 0.54, 0.52)  # the colour of walls and colliders
@@ -54,9 +51,10 @@ def render(
     Args:
         run: a run with frames.
         path: the picture to write; its suffix says of which kind.
-        colour: "speed", "volume", "energy", "pressure", "von_mises", "density", or the name of what a law remembers,
-            such as snow's "plastic_volume"; None or "none" to see the shape alone, materials in colours of their own.
-            Pressure and von Mises stress are averages over the particles around (`analysis.smoothed`).
+        colour: "speed", "J", "energy", "pressure", "von_mises", "density", "material", "mass", "volume", "particle",
+            or the name of what a law remembers, such as snow's "plastic_volume"; None or "none" to see the shape
+            alone, materials in colours of their own. Pressure and von Mises stress are averages over the particles
+            around (`analysis.smoothed`).
         frame: which frame a still shows; counts from the end if negative. Default: the last.
         view: in three dimensions, azimuth and elevation of the eye [degrees]. At azimuth 0 the first horizontal axis
             points to the right; the elevation is above 0 and at most 90.
@@ -90,8 +88,11 @@ def render(
     require_between("view's elevation [degrees]", view[1], 0.1, 90)
     still = path.suffix != ".gif"
     shown = [len(run) - 1 if frame is None else frame % len(run)] if still else range(len(run))
-    label, value = ("", lambda run, q: np.full(q.count, np.nan)) if colour is None else quantities[colour]
-    values = np.stack([np.asarray(value(run, run.frame(i))) for i in shown])
+    label, value = ("", lambda scene, q: np.full(q.count, np.nan)) if colour is None else quantities[colour]
+    values = np.stack([np.asarray(value(run.scene, run.frame(i)), float) for i in shown])
+    if colour in _SMOOTHED:
+        each = zip(shown, values, strict=True)
+        values = np.stack([np.asarray(smoothed(run.scene, run.frame(i), jnp.asarray(a))) for i, a in each])
     from matplotlib import (  # here, since it takes a second that only pictures should pay
         animation,
         cm,
@@ -119,9 +120,9 @@ def render(
         plt.close(figure)
 
 
-def _remembered(name: str, run: Any, particles: Particles) -> np.ndarray:
+def _remembered(name: str, scene: Any, particles: Particles) -> np.ndarray:
     """The history variable of that name; NaN at particles whose law has none."""
-    del run
+    del scene
     values = np.full(particles.count, np.nan)
     for remembered, rows, leaf in history_arrays(particles):
         if remembered == name:
