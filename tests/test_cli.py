@@ -15,7 +15,7 @@ from shell import refused, shell
 
 import mpmjax as mpm
 from mpmjax.cli._commands import _summary
-from mpmjax.cli._fit_file import read_fit
+from mpmjax.cli._fit_file import leaf_of, read_fit
 from mpmjax.cli._scene_file import read_scene_file, read_simulation
 from mpmjax.fitting._columns import read_columns
 from mpmjax.viz import COLOURS
@@ -442,7 +442,47 @@ def test_a_file_may_name_several_materials(tmp_path):
     np.testing.assert_array_equal(run.final.x, plain.final.x)
 
 
+NAMED = (
+    TWO.replace('[[material]]\nkind = "VonMises"', '[material.metal]\nkind = "VonMises"')
+    .replace("[[material]]\nkind", "[material.jelly]\nkind")
+    .replace("material = 2", 'material = "jelly"')
+)
+
+
+def test_materials_may_have_names(tmp_path):
+    """The same scene as by numbers; names are in the file, in what is said of it, and in dotted paths."""
+    (tmp_path / "two.toml").write_text(TWO)
+    (tmp_path / "named.toml").write_text(NAMED)
+    two, named = (read_simulation(tmp_path / f"{name}.toml") for name in ("two", "named"))
+    assert named.scene.names == ("metal", "jelly")
+    assert eqx.tree_equal(two.particles, named.particles)
+    assert eqx.tree_equal(two.scene.laws, named.scene.laws)
+    again = mpm.Scene(named.scene.grid, dict(zip(named.scene.names, named.scene.laws, strict=True)))
+    assert again.titles == named.scene.titles == ("metal (VonMises)", "jelly (FixedCorotated)")
+    seen = mpm.Curve([0.01], [0.1], lambda run: run.final.x[:1, 0], sigma=0.01)
+    experiment = mpm.Experiment(named.scene, named.particles, t1=0.01, dt=0.01, observations=seen)
+    assert leaf_of("scene.material.metal.yield_stress", experiment) == 1e2
+    changed = read_simulation(tmp_path / "named.toml", ["material.metal.yield_stress=2e2"])
+    assert changed.scene.laws[0].yield_stress == 2e2
+    run = mpm.simulate(named.scene, named.particles, t1=0.01, dt=0.01, method=mpm.SemiImplicit(), save_every=1)
+    mpm.save(tmp_path / "named.h5", run)
+    assert mpm.load(tmp_path / "named.h5").scene.names == named.scene.names
+    assert "metal (VonMises), jelly (FixedCorotated)" in shell("info", tmp_path / "named.h5")[1]
+    with h5py.File(tmp_path / "named.h5") as file:
+        assert file["mpmjax"].attrs["materials"] == b"metal (VonMises), jelly (FixedCorotated)"
+        assert set(file["VTKHDF/PointData/material"][:12]) == {1}
+        assert set(file["VTKHDF/PointData/material"][12:]) == {1, 2}  # of two frames
+
+
 BAD_MATERIALS = {
+    "no such name": (NAMED, 'material = "jelly"', 'material = "gel"', r"name of a .* metal, jelly, .* got 'gel'"),
+    "a name left over": (NAMED, "density = 2e3", 'density = 2e3\nmaterial = "jelly"', r"\[material\.metal\] has no"),
+    "key of a named law": (
+        NAMED,
+        "poisson_ratio = 0.3",
+        "poison_ratio = 0.3",
+        r"\[material\.jelly\]: .*'poisson_ratio'",
+    ),
     "no such material": (TWO, "material = 2", "material = 3", r"\[\[particles\]\] 1 material .* from 1 to 2, got 3"),
     "material zero": (TWO, "material = 2", "material = 0", r"\[\[particles\]\] 1 material .* from 1 to 2, got 0"),
     "no number": (TWO, "material = 2", 'material = "jelly"', r"\[\[particles\]\] 1 material .*, got 'jelly'"),

@@ -250,7 +250,7 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
     def say(name: str, text: str) -> None:
         print(f"{name:<18} {text}", flush=True)
 
-    say("materials", ", ".join(law.title() for law in scene.laws))
+    say("materials", ", ".join(scene.titles))
     each = float(particles.volume.mean()) / dx**particles.dim
     say("particles", f"{particles.count} of {particles.x.dtype}, {1 / each:.3g} a cell, {particles.mass.sum():.6g} kg")
     say("from, to", f"{x.min(axis=0)} m, {x.max(axis=0)} m")
@@ -300,7 +300,7 @@ def describe_run(path: Path) -> str:
     lines = {
         "file": f"{path}, {_bytes(path.stat().st_size)}, {run.final.x.dtype}",
         "frames": f"{len(run)}, from t = {float(run.times[0]):.6g} s to {float(run.times[-1]):.6g} s",
-        "materials": ", ".join(law.title() for law in run.scene.laws),
+        "materials": ", ".join(run.scene.titles),
     }
     return "\n".join([*(f"{name:<18} {text}" for name, text in lines.items()), _summary(run.frame(0), run)])
 

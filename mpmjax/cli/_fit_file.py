@@ -170,7 +170,9 @@ def _refined(simulation: Simulation, n: int) -> Simulation:
 def leaf_of(path: str, experiment: Experiment) -> Any:
     """The value at a dotted path, such as "scene.material.youngs_modulus" or "scene.boundary.0.friction"."""
     value: Any = experiment
+    materials = {name: str(i) for i, name in enumerate(experiment.scene.names)}
     for name in path.split("."):
+        name = materials.get(name, name) if value is experiment.scene.material else name
         try:
             value = value[int(name)] if name.isdecimal() else getattr(value, name)
         except (AttributeError, IndexError, TypeError):

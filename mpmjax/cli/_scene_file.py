@@ -223,11 +223,15 @@ def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
         where = f"[[particles]] {number}"
         require(isinstance(table, dict), f"{where} must be a table, got {shortened(repr(table))}.")
         material, rest = table.get("material", 1), {key: value for key, value in table.items() if key != "material"}
-        numbers = range(1, len(scene.laws) + 1)
+        material = scene.names.index(material) + 1 if material in scene.names else material
+        one = (
+            f"the name of a [material.NAME], {', '.join(scene.names)}, or its number"
+            if scene.names
+            else (f"the number of a [[material]], from 1 to {len(scene.laws)}")
+        )
         require(
-            type(material) is int and material in numbers,
-            f"{where} material must be the number of a [[material]], from 1 to {len(scene.laws)}, got "
-            f"{shortened(repr(material))}.",
+            type(material) is int and material in range(1, len(scene.laws) + 1),
+            f"{where} material must be {one}, got {shortened(repr(material))}.",
         )
         keys = arguments(fill, rest, where, without=("grid", "dtype"))
         region: AbstractRegion = keys["region"]
@@ -255,8 +259,7 @@ def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
                     f"{inside} particles of [[particles]] {j} lie in the region of [[particles]] {i}: where two fill "
                     "the same place there is twice the mass."
                 )
-    for number, sets in enumerate(filled, 1):
-        require(
-            len(sets) > 0, f"[[material]] {number} has no particles: name it in a [[particles]] table, or leave it out."
-        )
+    for number, sets in enumerate(filled):
+        place = f"[material.{scene.names[number]}]" if scene.names else f"[[material]] {number + 1}"
+        require(len(sets) > 0, f"{place} has no particles: name it in a [[particles]] table, or leave it out.")
     return join(*(replace(join(*sets), counts=None) for sets in filled))

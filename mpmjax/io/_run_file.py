@@ -227,7 +227,7 @@ def created(staged: StagedFile, path: Path, described: dict[str, Any], rows: dic
     not take it, since the run's dtype rounds a number to one that is not allowed."""
     dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
     try:
-        decode(described["scene"], Scene, "", arrays)
+        scene = decode(described["scene"], Scene, "", arrays)
         decode(described["method"], AbstractIntegrator, "method", arrays)
     except ValueError as error:
         raise FileRefusedError(f"{path} could not be loaded again, as {dtype} rounds it: {error}") from None
@@ -259,8 +259,9 @@ def created(staged: StagedFile, path: Path, described: dict[str, Any], rows: dic
     for name, data in rows.items():
         grow(file, name, data)
     group = file["mpmjax"]
-    for name, text in {"version": version("mpmjax"), "units": _UNITS, "dtype": described["dtype"]}.items():
-        group.attrs.create(name, np.bytes_(text))  # of fixed length: others lie where HDF5 has no checksum
+    texts = {"version": version("mpmjax"), "units": _UNITS, "dtype": described["dtype"]}
+    for name, text in (texts | {"materials": ", ".join(scene.titles)}).items():
+        group.attrs.create(name, np.bytes_(text.encode()))  # of fixed length: others lie where HDF5 has no checksum
     group.attrs["format"] = np.int64(FORMAT)
     group.attrs["d"] = np.int64(described["d"])
     if described["counts"] is not None:

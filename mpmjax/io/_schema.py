@@ -154,6 +154,9 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         *outer, header = where.split(" ")  # of one of a list of tables it is that of the list in further brackets
         nth = " ".join([*outer, f"[{header}]"])
         return tuple(decode(d, items[0], f"{nth} {i}", arrays) for i, d in enumerate(data, 1))
+    named = [get_args(a)[1] for a in options if get_origin(a) is dict]
+    if named and isinstance(data, dict) and data and all(isinstance(d, dict) for d in data.values()):  # of objects
+        return {name: decode(d, named[0], f"{where[:-1]}.{name}]", arrays) for name, d in data.items()}
     number = isinstance(data, (int, float)) and not isinstance(data, bool) and (float, 0) in _forms(expected)
     if any(is_class(a, eqx.Module) for a in options) and not number:
         table: Any = {"kind": data} if isinstance(data, str) else data

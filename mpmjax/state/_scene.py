@@ -128,7 +128,8 @@ class Scene(eqx.Module):
 
     Args:
         grid: the background grid.
-        material: the law; or several, each for a group of the particles (see `join`).
+        material: the law; or several, each for a group of the particles (see `join`); or a dict of them by the names
+            that files and pictures are to call them.
         gravity: body acceleration [m/s²], (d,). Default: none.
         boundary: one boundary condition or several; where two prescribe the same component, the earlier holds.
         kernel: B-spline. Default: quadratic.
@@ -142,6 +143,7 @@ class Scene(eqx.Module):
         bodies: which materials are bodies of their own, that touch each other. Default: all share the nodes.
         volume: `AveragedVolume()` for nearly incompressible bodies. Default: each particle has its own volume.
         boundary_forces: whether steps compute the force and torque on each boundary (see `Run.boundary_forces`).
+        names: names of the materials, where `material` is no dict. Default: none.
 
     Raises:
         ValueError: dimensions that differ, a mirrored plane off the half-spacing lattice, or what the total description
@@ -162,12 +164,13 @@ class Scene(eqx.Module):
     loads: tuple[AbstractLoad, ...]
     bodies: Bodies | None
     volume: AveragedVolume | None
+    names: tuple[str, ...] = eqx.field(static=True)
 
     @checked
     def __init__(
         self,
         grid: Grid,
-        material: AbstractLaw | tuple[AbstractLaw, ...] | list[AbstractLaw],
+        material: AbstractLaw | tuple[AbstractLaw, ...] | list[AbstractLaw] | dict[str, AbstractLaw],
         *,
         gravity: Point | None = None,
         boundary: AbstractBoundary | tuple[AbstractBoundary, ...] | list[AbstractBoundary] = (),
@@ -180,8 +183,11 @@ class Scene(eqx.Module):
         loads: AbstractLoad | tuple[AbstractLoad, ...] | list[AbstractLoad] = (),
         bodies: Bodies | None = None,
         volume: AveragedVolume | None = None,
+        names: tuple[str, ...] = (),
     ):
-        self.material = tuple(material) if isinstance(material, list) else material
+        if isinstance(material, dict):
+            names, material = tuple(material), list(material.values())
+        self.material, self.names = tuple(material) if isinstance(material, list) else material, names
         layers = 1 if bodies is None else 1 + max(bodies.numbers(len(self.laws)))
         self.grid = grid if grid.layers == layers else grid.with_layers(layers)
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
@@ -199,6 +205,10 @@ class Scene(eqx.Module):
         require(coordinates("gravity", self.gravity) == d, f"gravity must have {d} components, got {self.gravity}.")
         require_finite("gravity", self.gravity)
         require(len(self.laws) > 0, "A scene needs at least one law, got none.")
+        require(
+            len(set(self.names)) in (0, len(self.laws)),
+            f"The names must be one for each of the scene's {len(self.laws)} materials, or none, got {self.names}.",
+        )
         require(
             not self.boundary_forces or len(self.boundary) + len(self.guides) > 0,
             "A scene with boundary_forces needs a boundary at least, or a Rigid body with guides, got none: give one, "
@@ -269,6 +279,12 @@ class Scene(eqx.Module):
     def laws(self) -> tuple[AbstractLaw, ...]:
         """The laws, one for each material."""
         return self.material if isinstance(self.material, tuple) else (self.material,)
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """The materials in words: their names, if they have some, and their laws."""
+        laws = tuple(law.title() for law in self.laws)
+        return tuple(f"{name} ({law})" for name, law in zip(self.names, laws, strict=True)) if self.names else laws
 
     @property
     def rigid_bodies(self) -> tuple[RigidMaterial, ...]:
