@@ -94,7 +94,7 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
                 command(*args, **kwargs)
         except typer.Exit:  # a RuntimeError too
             raise
-        except (ValueError, RuntimeError, OSError, MemoryError) as error:
+        except (ValueError, RuntimeError, OSError, MemoryError, ImportError) as error:
             tell(f"mpmjax: {' '.join(str(error).split()) or 'there is not enough memory for this'}")
             raise typer.Exit(2) from None
 

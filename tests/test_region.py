@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 from helpers import assert_close, ids, thorough
 from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
 
 import mpmjax as mpm
+from mpmjax.cli._scene_file import _find_meshes
+from mpmjax.geometry import surface_pieces
+from mpmjax.io import decode
 
 REGIONS = {
     "ball-1d": mpm.Ball((0.1,), 0.4),
@@ -27,6 +31,14 @@ REGIONS = {
     "half_space-2d": mpm.HalfSpace((0.1, 0.1), (3.0, 4.0)),
     "half_space-3d": mpm.HalfSpace((0.1, 0.1, 0.0), (3.0, 4.0, -1.0)),
     "union-2d": mpm.geometry.Union((mpm.Ball((-0.4, 0.0), 0.2), mpm.Box((0.1, -0.3), (0.5, 0.3)))),
+    "intersection-2d": mpm.geometry.Intersection((mpm.Ball((0.0, 0.0), 0.6), mpm.Box((0.0, 0.0), (np.inf, np.inf)))),
+    "complement-2d": mpm.geometry.Complement(mpm.Box((-0.3, -0.2), (0.4, 0.3))),
+    "placed-2d": mpm.geometry.Placed(
+        mpm.Box((-0.3, -0.2), (0.5, 0.1)), (1.0, 2.0), 0.2, displacement=(0.1, -0.1), centre=(0.2, 0.1)
+    ),
+    "placed-3d": mpm.geometry.Placed(
+        mpm.Box((-0.5, -0.4, -0.6), (0.6, 0.5, 0.4)), mirror=(0.0, 3.0, 0.0), rotation=(0.1, -0.1, 0.05)
+    ),
 }
 SAMPLED = {f"sampled-{d}d": mpm.geometry.sample_distance(mpm.Ball((0.1,) * d, 0.35), 0.05) for d in (1, 2, 3)}
 EACH = pytest.mark.parametrize("region", **ids(REGIONS))
@@ -50,15 +62,29 @@ def lateral_points(region, sphere, rng):
     return a + rng.random((len(sphere), 1)) * (b - a) + region.radius * across_of(a, b, sphere)
 
 
+def moved(region, X, back=False):
+    """Points of a placed region's own region in its place, or the other way round."""
+    d = region.dim
+    centre = np.zeros(d) if region.centre is None else np.asarray(region.centre)
+    by = centre + (0.0 if region.displacement is None else np.asarray(region.displacement))
+    n = np.asarray(region.mirror) / np.linalg.norm(region.mirror)
+    turn = Rotation.from_rotvec(region.rotation if d == 3 else (0, 0, region.rotation)).as_matrix()[:d, :d]
+    A = turn @ (np.eye(d) - 2 * np.outer(n, n))
+    return centre + (X - by) @ A if back else by + (X - centre) @ A.T
+
+
 @functools.cache
-def surface_of(region_name):
+def surface_of(region):
     """Points of the surface and whether a point is inside, each from the set's own definition."""
     n, rng = 200_000, np.random.default_rng(2)
-    region = REGIONS[region_name]
     d = region.dim
     sphere = rng.normal(size=(n, d))
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
     match region:
+        case mpm.geometry.Placed():
+            return moved(region, surface_of(region.region))
+        case mpm.geometry.Complement():
+            return surface_of(region.region)
         case mpm.Ball():
             return np.asarray(region.centre) + region.radius * sphere
         case mpm.geometry.Annulus():
@@ -91,11 +117,11 @@ def surface_of(region_name):
     raise AssertionError
 
 
-@pytest.mark.parametrize("name", [name for name in REGIONS if not name.startswith("union")])
+@pytest.mark.parametrize("name", [name for name in REGIONS if not name.startswith(("union", "intersection"))])
 def test_the_distance_is_that_of_the_nearest_point_of_the_surface(name):
     """In size, by brute force over points of the surface: never more than theirs, and less by their spacing at most."""
     region = REGIONS[name]
-    surface = surface_of(name)
+    surface = surface_of(region)
     x = points(region, 40)
     nearest = cdist(np.asarray(x), surface).min(axis=1)
     distance = np.abs(np.asarray(region.distance(x)))
@@ -115,6 +141,12 @@ def inside(region, x):
             return (x - np.asarray(region.point)) @ np.asarray(region.normal) < 0
         case mpm.geometry.Union():
             return np.any([inside(r, x) for r in region.regions], axis=0)
+        case mpm.geometry.Intersection():
+            return np.all([inside(r, x) for r in region.regions], axis=0)
+        case mpm.geometry.Complement():
+            return ~inside(region.region, x)
+        case mpm.geometry.Placed():
+            return inside(region.region, moved(region, x, back=True))
         case mpm.geometry.Annulus():
             r = np.linalg.norm(x - np.asarray(region.centre), axis=1)
             return (r > region.inner) & (r < region.outer)
@@ -140,10 +172,10 @@ def test_it_is_negative_inside_and_the_bounds_hold_all_of_it(region):
     assert within.any()
     assert (held >= lower).all()
     assert (held <= upper).all()
-    if not isinstance(region, mpm.HalfSpace):  # and they are tight
+    if np.isfinite(lower).all():  # and they are tight
         assert (held.min(axis=0) - lower < 0.15).all()
         assert (upper - held.max(axis=0) < 0.15).all()
-        assert (np.abs(region.middle() - (lower + upper) / 2) < 0.1).all()
+        assert (np.abs(region.middle() - (lower + upper) / 2) < 0.1).all() or hasattr(region, "regions")
 
 
 @EACH
@@ -243,11 +275,51 @@ def test_a_mesh_is_sampled():
         mpm.geometry.sample_mesh((corners, faces[:-1]), 0.05)
 
 
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+def test_a_scene_file_names_a_mesh_with_its_scale_and_place(suffix, tmp_path):
+    """The file lies beside that of the scene, and may be in millimetres, of which units that are wrong remind."""
+    import trimesh
+
+    trimesh.creation.box((500, 500, 500)).export(tmp_path / f"part.{suffix}")
+    table = {"kind": "Mesh", "file": f"part.{suffix}", "spacing": 0.125, "scale": 1e-3}
+    _find_meshes([{"region": {"kind": "Placed", "region": table}}], tmp_path)
+    region = decode(table, mpm.geometry.AbstractRegion)
+    exact = mpm.geometry.sample_distance(mpm.Box((-0.25,) * 3, (0.25,) * 3), 0.125)
+    np.testing.assert_allclose(region.lower, exact.lower)
+    np.testing.assert_allclose(region.values, exact.values, atol=1e-6)
+    for scale, says in ((1.0, "measures 500 x 500 x 500 m"), (1e-6, "less than the spacing 0.125 m")):
+        with pytest.raises(ValueError, match=f"{says}.* give scale = 1e-3 for a file in millimetres"):
+            decode(table | {"scale": scale}, mpm.geometry.AbstractRegion)
+    for file in ("nowhere.stl", __file__):
+        with pytest.raises(ValueError, match="no mesh"):
+            decode(table | {"file": file}, mpm.geometry.AbstractRegion)
+    with pytest.raises(ValueError, match="Unknown kind 'Mesh'"):  # a run's file holds what was made of it
+        decode(table, mpm.geometry.AbstractRegion, arrays={})
+
+
 def test_without_trimesh_it_is_said_how_to_get_it(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
     monkeypatch.setitem(__import__("sys").modules, "rtree", None)
     with pytest.raises(ImportError, match=r"mpmjax\[mesh\]"):
         mpm.geometry.sample_mesh("part.stl", 0.1)
+
+
+def test_an_intersection_is_filled_and_pressed_as_the_part_that_it_is():
+    """A quarter cylinder has a quarter of the volume, its round face a quarter of the area; so has its image beside
+    it, and a ring cut by a hole the area of the ring."""
+    cylinder, quarter = mpm.geometry.Cylinder((0.0,) * 3, (0.0, 0.0, 0.4), 0.5), mpm.Box((0.0,) * 3, (np.inf,) * 3)
+    part, grid = mpm.geometry.Intersection((cylinder, quarter)), mpm.Grid((16, 16, 12), 0.1, origin=(-8, -1, -1))
+    np.testing.assert_allclose(mpm.fill(part, grid, density=1.0).volume.sum(), np.pi * 0.25 * 0.4 / 4, rtol=2e-3)
+    round_face = surface_pieces(part, 0.05, within=mpm.Box((0.01, 0.01, 0.01), (1.0, 1.0, 0.39)))
+    whole = np.pi / 2 * 0.5 - 2 * 0.5 * np.arcsin(0.01 / 0.5)  # but for strips along the planes
+    np.testing.assert_allclose(round_face.size.sum(), whole * 0.38, rtol=2e-3)
+    image = mpm.geometry.Placed(part, mirror=(1.0, 0.0, 0.0))
+    np.testing.assert_allclose(image.bounds(), [[-0.5, 0.0, 0.0], [0.0, 0.5, 0.4]], atol=1e-15)
+    ring = mpm.geometry.Intersection((mpm.Ball((0.0, 0.0), 0.5), mpm.geometry.Complement(mpm.Ball((0.0, 0.0), 0.3))))
+    x = points(ring)
+    np.testing.assert_allclose(ring.distance(x), mpm.geometry.Annulus((0.0, 0.0), 0.3, 0.5).distance(x), atol=1e-15)
+    turned = mpm.geometry.Placed(mpm.geometry.Cylinder((0.0,) * 3, (0.0, 0.0, 0.4), 0.5), rotation=(0.5, 0.0, 0.0))
+    np.testing.assert_allclose(mpm.fill(turned, grid, density=1.0, fitted=True).volume.sum(), np.pi * 0.25 * 0.4)
 
 
 @pytest.mark.parametrize("region", [REGIONS["cylinder-3d"], REGIONS["capsule-2d"], REGIONS["union-2d"]])
@@ -277,6 +349,11 @@ def test_any_bounded_region_can_be_filled(region):
         (lambda: mpm.geometry.Cylinder((0.0, 0.0), (1.0, 0.0), -1.0), "radius must be greater than zero"),
         (lambda: mpm.geometry.Union(()), "at least one region"),
         (lambda: mpm.geometry.Union((mpm.Ball((0.0,), 1.0), mpm.Ball((0.0, 0.0), 1.0))), "the same dimension"),
+        (lambda: mpm.geometry.Intersection(()), "An intersection needs at least one region"),
+        (lambda: mpm.geometry.Placed(mpm.Ball((0.0,), 1.0), rotation=1.0), "none in one"),
+        (lambda: mpm.geometry.Placed(mpm.Ball((0.0, 0.0), 1.0), rotation=(0.0, 0.0, 1.0)), "one angle in two"),
+        (lambda: mpm.geometry.Placed(mpm.Ball((0.0, 0.0), 1.0), mirror=(0.0, 0.0)), "mirror must not be zero"),
+        (lambda: mpm.geometry.Placed(mpm.Ball((0.0, 0.0), 1.0), displacement=(0.0,)), "must have 2 coordinates"),
         (
             lambda: mpm.geometry.SampledDistance((0.0,), 0.1, np.ones((5, 5))),
             "as many coordinates as its values have axes",

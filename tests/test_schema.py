@@ -64,6 +64,9 @@ EXAMPLES = {
     mpm.geometry.Annulus: mpm.geometry.Annulus((0.1, 0.2), 0.3, 0.4),
     mpm.geometry.Tube: mpm.geometry.Tube((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.1, 0.2),
     mpm.geometry.Union: mpm.geometry.Union((mpm.Ball((0.1, 0.2), 0.3), mpm.Box((0.0, 0.1), (1.0, 1.1)))),
+    mpm.geometry.Intersection: mpm.geometry.Intersection((mpm.Ball((0.1, 0.2), 0.3), mpm.Box((0.0, 0.1), (1.0, 1.1)))),
+    mpm.geometry.Complement: mpm.geometry.Complement(mpm.Ball((0.1, 0.2), 0.3)),
+    mpm.geometry.Placed: mpm.geometry.Placed(mpm.Ball((0.1, 0.2), 0.3), rotation=0.3, centre=(1.0, 0.0)),
     mpm.geometry.SampledDistance: mpm.geometry.SampledDistance((0.1, 0.2), 0.1, np.linspace(-1, 1, 20).reshape(4, 5)),
     mpm.StickyCollider: mpm.StickyCollider(mpm.Ball((0.1, 0.2), 0.3), GRIP.motion),
     mpm.SlipCollider: mpm.SlipCollider(mpm.HalfSpace((0.1, 0.2), (0.0, 1.0))),
@@ -249,6 +252,27 @@ BODIES = {
         'kind = "SlipCollider"\n[boundary.shape]\nkind = "Union"\n'
         'regions = { kind = "Ball", centre = [0.3, 0.4], radius = 0.2 }',
         mpm.SlipCollider(mpm.geometry.Union(DISK)),
+    ),
+    "pot that leans": (
+        """kind = "SlipCollider"
+        [boundary.shape]
+        kind = "Placed"
+        rotation = 0.3
+        mirror = [1, 0]
+        centre = [0.3, 0.4]
+        region = { kind = "Complement", region = { kind = "Intersection", regions = [
+            { kind = "Ball", centre = [0.3, 0.4], radius = 0.2 }, { kind = "Box", lower = [0, -inf], upper = [1, 0.5] },
+        ] } }""",
+        mpm.SlipCollider(
+            mpm.geometry.Placed(
+                mpm.geometry.Complement(
+                    mpm.geometry.Intersection((DISK, mpm.Box((0.0, -np.inf), (1.0, 0.5)))),
+                ),
+                mirror=(1.0, 0.0),
+                rotation=0.3,
+                centre=(0.3, 0.4),
+            )
+        ),
     ),
     "capsule": (
         'kind = "SeparatingCollider"\nshape = { kind = "Capsule", start = [0, 0], end = [0.5, 0.5], radius = 0.1 }',

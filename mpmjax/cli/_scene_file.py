@@ -109,6 +109,7 @@ def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
     table = scene_table(path, changes)
     fit_table = table.pop("fit", None)
     require(fit_table is None or isinstance(fit_table, dict), f"{path}: [fit] must be a table.")
+    _find_meshes(table, path.parent)
     groups, run_table, output_table = table.pop("particles"), table.pop("run"), table.pop("output", {})
     groups = groups if isinstance(groups, list) else [groups]
     try:
@@ -191,6 +192,14 @@ def stable_step(path: Path, file: SceneFile) -> float:
         return float(stable_dt(file.scene, file.particles, method=file.run.method, t1=file.run.t1))
     except ValueError as error:
         raise ValueError(f'{path}: [run] dt = "stable": {error}') from None
+
+
+def _find_meshes(table: Any, folder: Path) -> None:
+    """Names of meshes, which are relative to the scene file, as paths."""
+    for value in table.values() if isinstance(table, dict) else table if isinstance(table, list) else ():
+        _find_meshes(value, folder)
+    if isinstance(table, dict) and table.get("kind") == "Mesh" and isinstance(table.get("file"), str):
+        table["file"] = str(folder / table["file"])
 
 
 def _refined(table: dict[str, Any], n: int) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Corner, Float, Point, Scalar
-from mpmjax.checks import checked, coordinates, require, require_fields, require_finite, require_that
+from mpmjax.checks import coordinates, require, require_fields, require_finite, require_that
 
 Cells = tuple[np.ndarray, np.ndarray]
 """Centroids [m], shape (m, d), and volumes [m^d], shape (m,), of cells fitted to a body."""
@@ -166,37 +166,3 @@ class HalfSpace(AbstractRegion):
 
     def middle(self) -> Float[Array, "d"]:
         return jnp.asarray(self.point)
-
-
-class Union(AbstractRegion):
-    """The union of several regions. Its distance is exact outside; inside, where regions overlap, it may be too small
-    in magnitude.
-
-    Args:
-        regions: the regions.
-    """
-
-    regions: tuple[AbstractRegion, ...]
-
-    @checked
-    def __init__(self, regions: AbstractRegion | tuple[AbstractRegion, ...] | list[AbstractRegion]):
-        self.regions = (regions,) if isinstance(regions, AbstractRegion) else tuple(regions)
-
-    def __check_init__(self):
-        require(len(self.regions) > 0, "A union needs at least one region, got none.")
-        dims = [region.dim for region in self.regions]
-        require(len(set(dims)) == 1, f"A union's regions must have the same dimension, got {dims}.")
-
-    @property
-    def dim(self) -> int:
-        return self.regions[0].dim
-
-    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
-        return jnp.stack([region.distance(x) for region in self.regions]).min(axis=0)
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        lower, upper = zip(*(region.bounds() for region in self.regions), strict=True)
-        return np.min(lower, axis=0), np.max(upper, axis=0)
-
-    def middle(self) -> Float[Array, "d"]:
-        return jnp.stack([region.middle() for region in self.regions]).mean(axis=0)

@@ -19,6 +19,7 @@ from mpmjax.checks import (
     require_memory,
     require_positive,
     shape_of,
+    shortened,
     warn,
 )
 from mpmjax.discretisation import BSpline
@@ -116,34 +117,49 @@ def sample_distance(region: AbstractRegion, spacing: float) -> SampledDistance:
 
 
 @checked
-def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float) -> SampledDistance:
+def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float, *, scale: float = 1.0) -> SampledDistance:
     """Sample the signed distance from a closed surface of triangles. Needs the extra `mesh` (trimesh, rtree).
 
     Args:
-        mesh: a file that trimesh reads (STL, OBJ, PLY, ...), in metres, or vertices [m], (j, 3), and faces, (k, 3).
+        mesh: a file that trimesh reads (STL, OBJ, PLY, ...), or vertices, (j, 3), and faces, (k, 3).
         spacing: distance between samples [m].
+        scale: factor to metres: 1e-3 of a file in millimetres.
 
     Raises:
         ImportError: trimesh or rtree is not installed.
-        ValueError: a surface that is not closed, or whose faces do not all point outwards.
+        ValueError: a file that is missing or no mesh; a surface that is not closed, or whose faces do not all point
+            outwards; one whose size shows, beside the spacing, that it is not in these units.
     """
     try:
         import rtree  # noqa: F401 # pyright: ignore[reportMissingImports]  # without it trimesh fails, later
         import trimesh  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError('A mesh needs trimesh and rtree: pip install "mpmjax[mesh]".') from error
+    require_positive("A mesh's scale", scale)
     if isinstance(mesh, tuple):
         shapes = [shape_of(part) for part in mesh]
         triangles = all(shape is not None and len(shape) == 2 and shape[1] == 3 for shape in shapes)
         require(triangles, f"A mesh must be vertices of shape (j, 3) and faces of shape (k, 3), got shapes {shapes}.")
-    surface = trimesh.Trimesh(*mesh) if isinstance(mesh, tuple) else trimesh.load(str(mesh), force="mesh")
+        surface: Any = trimesh.Trimesh(*mesh)
+    else:
+        require(Path(mesh).is_file(), f"There is no mesh {mesh}.")
+        try:
+            surface = trimesh.load_mesh(str(mesh))
+        except Exception as error:  # of the readers of many formats, which may raise anything
+            fault = shortened(" ".join(str(error).split()))
+            raise ValueError(f"{mesh} is no mesh that can be read: {fault}") from None
+        require(len(getattr(surface, "faces", ())) > 0, f"{mesh} holds no triangles.")
     require(
-        surface.is_volume,  # pyright: ignore[reportAttributeAccessIssue]
+        surface.is_volume,
         "A mesh must be a closed surface whose faces all point outwards, got holes or faces that do not: repair it.",
     )
-    points = _lattice(surface.bounds[0], surface.bounds[1], spacing)
-    values = -trimesh.proximity.signed_distance(surface, points.reshape(-1, 3))  # trimesh's is positive inside
-    return _of_volume(float(surface.volume), values.reshape(points.shape[:-1]), points, spacing)  # pyright: ignore
+    lower, upper = np.asarray(surface.bounds) * scale
+    size = f"The mesh measures {' x '.join(f'{side:.3g}' for side in upper - lower)} m"
+    units = "give scale = 1e-3 for a file in millimetres, 1 for one in metres"
+    require((upper - lower).max() > spacing, f"{size}, less than the spacing {spacing:.3g} m of its samples: {units}.")
+    points = _lattice(lower, upper, spacing, f" {size}: {units}.")
+    values = -scale * trimesh.proximity.signed_distance(surface, points.reshape(-1, 3) / scale)  # inside: positive
+    return _of_volume(float(surface.volume) * scale**3, values.reshape(points.shape[:-1]), points, spacing)
 
 
 def _of_volume(volume: float, values: np.ndarray, points: np.ndarray, spacing: float) -> SampledDistance:
@@ -181,8 +197,8 @@ def _volume(region: AbstractRegion, values: np.ndarray, points: np.ndarray, spac
     return float((share.mean() * near.sum() + (~near & (values[cells] < 0)).sum()) * spacing**d)
 
 
-def _lattice(lower: np.ndarray, upper: np.ndarray, spacing: float) -> np.ndarray:
-    """The points of a lattice around a bounding box, (..., d)."""
+def _lattice(lower: np.ndarray, upper: np.ndarray, spacing: float, hint: str = "") -> np.ndarray:
+    """The points of a lattice around a bounding box, (..., d); `hint` ends what is said of one that is too large."""
     require_positive("The samples' spacing [m]", spacing)
     require(
         np.isfinite(lower) & np.isfinite(upper), f"Only a region with bounds can be sampled, got {lower} to {upper}."
@@ -194,7 +210,7 @@ def _lattice(lower: np.ndarray, upper: np.ndarray, spacing: float) -> np.ndarray
     require_memory(
         f"A lattice of {total:.3g} samples",
         total * (2 * len(lower) + 1) * 8,  # the coordinates, the points made of them, the distances
-        f"take a larger spacing than {spacing} m for a shape from {lower} to {upper} m.",
+        f"take a larger spacing than {spacing} m for a shape from {lower} to {upper} m.{hint}",
     )
     counts = numbers.astype(int)
     axes = [a + spacing * np.arange(n) for a, n in zip(first, counts, strict=True)]

@@ -25,7 +25,9 @@ import jax
 import numpy as np
 from jaxtyping import AbstractArray
 
+from mpmjax._types import Scalar
 from mpmjax.checks import alternatives, choices, is_abstract, is_class, is_own, may_be_infinite, require, shortened
+from mpmjax.geometry import SampledDistance, sample_mesh
 from mpmjax.state import Scene
 from mpmjax.stepping import AbstractIntegrator
 
@@ -91,6 +93,15 @@ def saved_classes() -> tuple[type, ...]:
     return tuple(reached)
 
 
+def _mesh(file: str, spacing: Scalar, scale: Scalar = 1.0) -> SampledDistance:
+    """The region within a mesh in a file, see `sample_mesh`."""
+    return sample_mesh(file, float(spacing), scale=float(scale))
+
+
+_MADE: dict[str, tuple[Callable[..., Any], type]] = {"Mesh": (_mesh, SampledDistance)}
+"""Kinds that scene files may name beside classes: functions, and what they make, which a run's file then holds."""
+
+
 def _known() -> tuple[type, ...]:
     return (*saved_classes(), *_registered.values())
 
@@ -147,8 +158,11 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     name, such as "[material]", `arrays` what `encode` put aside. A ValueError says in one line what is unknown,
     missing or unfit, or what the constructor refuses."""
     options = alternatives(expected)
-    fitting = (c for c in _known() if any(is_class(a, eqx.Module) and issubclass(c, a) for a in options))
-    classes = {c.__name__: c for c in sorted(fitting, key=lambda c: c.__name__)}
+    fitting = [c for c in _known() if any(is_class(a, eqx.Module) and issubclass(c, a) for a in options)]
+    fitting.sort(key=lambda c: c.__name__)
+    classes: dict[str, Callable[..., Any]] = {c.__name__: c for c in fitting}
+    if arrays is None:  # a file that a person writes
+        classes |= {name: make for name, (make, cls) in _MADE.items() if cls.__name__ in classes}
     items = [get_args(a)[0] for a in options if get_origin(a) in (tuple, list)]
     if items and isinstance(data, list) and (classes or not _forms(expected)):  # of objects, or of arrays
         *outer, header = where.split(" ")  # of one of a list of tables it is that of the list in further brackets
@@ -165,7 +179,7 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
         # where no kind is given, the one class that is named by itself beside base classes, or the package's only one
         plain = [a.__name__ for a in options if is_class(a, eqx.Module) and not is_abstract(a)]
-        evident = plain if len(plain) == 1 else [name for name, c in classes.items() if is_own(c)]
+        evident = plain if len(plain) == 1 else [c.__name__ for c in fitting if is_own(c)]
         _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
         _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
         kind = table.get("kind", *evident) if len(evident) == 1 else table["kind"]
