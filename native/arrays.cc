@@ -6,7 +6,7 @@
 #include <numeric>
 #include <vector>
 
-#include "problems.h"
+#include "kernels.h"
 
 namespace mpmjax {
 namespace {

@@ -7,7 +7,7 @@
 #include <utility>
 #include <vector>
 
-#include "problems.h"
+#include "kernels.h"
 #include "xla/ffi/api/ffi.h"
 
 namespace ffi = xla::ffi;

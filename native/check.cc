@@ -4,7 +4,7 @@
 // sanitizer sees what reads or writes beyond; native/check compiles this with each of them.
 
 #include "check.h"
-#include "problems.h"
+#include "kernels.h"
 
 using namespace mpmjax;
 

@@ -3,7 +3,7 @@
 #include <numeric>
 
 #include "check.h"
-#include "problems.h"
+#include "kernels.h"
 
 namespace mpmjax {
 namespace {

@@ -3,7 +3,7 @@
 #include <cstdlib>
 #include <cstring>
 
-#include "problems.h"
+#include "kernels.h"
 
 namespace mpmjax {
 

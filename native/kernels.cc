@@ -2,6 +2,7 @@
 // itself, at the same time as others and in a part of the memory. Without a type, both.
 
 #include "gather.h"
+#include "kernels.h"
 #include "passes.h"
 #include "resist.h"
 #include "scatter.h"

@@ -4,7 +4,7 @@
 #include <limits>
 #include <memory>
 
-#include "problems.h"
+#include "kernels.h"
 
 namespace mpmjax {
 namespace {

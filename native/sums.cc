@@ -4,7 +4,7 @@
 #include <memory>
 #include <vector>
 
-#include "problems.h"
+#include "kernels.h"
 
 namespace mpmjax {
 namespace {

@@ -503,12 +503,12 @@ def test_runs_agree(choose, method):
 
 
 def test_one_variable_chooses(choose):
-    """MPMJAX_BACKEND is native, xla or nothing; native where there is no library is an error that says why."""
+    """MPMJAX_BACKEND is native, cuda, xla or nothing; native where there is no library is an error that says why."""
     choose("xla")
     assert mpm.native.backend().name == "xla"
     assert "MPMJAX_BACKEND=xla" in str(mpm.native.backend())
-    choose("cuda")
-    with pytest.raises(ValueError, match="must be native or xla"):
+    choose("other")
+    with pytest.raises(ValueError, match="must be native or cuda or xla"):
         mpm.native.backend()
 
 

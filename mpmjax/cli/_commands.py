@@ -27,7 +27,7 @@ from mpmjax.fitting import (
     profile,
 )
 from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, reporting, steps_in, stopping
-from mpmjax.native import backend
+from mpmjax.native import BACKENDS, backend
 from mpmjax.simulation import Problem, Run, initial_state, no_steps, run_to
 from mpmjax.state import Particles
 from mpmjax.stepping import Explicit, stable_dt, step
@@ -309,4 +309,5 @@ def installation() -> str:
     """The versions that run, the devices, and who sums between particles and nodes."""
     lines = [(name, version(name)) for name in ("mpmjax", "jax", "jaxlib")]
     lines += [("devices", ", ".join(map(str, jax.devices()))), ("sums", f"{backend()}")]
+    lines += [(kind.name, kind.absence() or "can be used") for kind in BACKENDS]
     return "\n".join(f"{name:<10} {text}" for name, text in lines)

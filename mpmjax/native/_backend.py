@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from mpmjax._types import Array
-from mpmjax.native._library import KERNELS, library
+from mpmjax.native._library import CUDA_KERNELS, KERNELS, cuda_library, library
 
 VARIABLE = "MPMJAX_BACKEND"
 
@@ -86,12 +86,7 @@ class Native(AbstractBackend):
     def has(self, kernel: str, arrays: Sequence[Any], *, basis: Any = None, **params: Any) -> bool:
         if kernel == "stored":
             return len(arrays) > 0
-        floats = {a.dtype for a in arrays if a.dtype not in (np.int32, np.bool_)}
-        one_kind = len(floats) <= 1 and floats <= {np.dtype("float32"), np.dtype("float64")}
-        if basis is not None:  # limits as in native/problems.h
-            few = max(len(basis.weights[0]), len(basis.slopes[0])) <= 9
-            one_kind = one_kind and few and len(basis.knots) in (2, 3, 4)
-        return one_kind and kernel in KERNELS
+        return kernel in KERNELS and _fits(arrays, basis)
 
     def __str__(self) -> str:
         handle = library().handle
@@ -103,24 +98,53 @@ class Native(AbstractBackend):
         return f"native, {instructions}, {threads} thread{'s' if threads != 1 else ''} ({self.reason})"
 
 
-BACKENDS: tuple[type[AbstractBackend], ...] = (Native,)
+class Cuda(AbstractBackend):
+    """Sums in CUDA for NVIDIA's cards, compiled for each card by the NVRTC that JAX brings: of what `Native` sums."""
+
+    name = "cuda"
+    platform = "cuda"
+
+    @staticmethod
+    def absence() -> str:
+        return cuda_library().reason
+
+    def has(self, kernel: str, arrays: Sequence[Any], *, basis: Any = None, **params: Any) -> bool:
+        return kernel in CUDA_KERNELS and _fits(arrays, basis)
+
+    def __str__(self) -> str:
+        return f"CUDA ({self.reason})"
+
+
+def _fits(arrays: Sequence[Any], basis: Any) -> bool:
+    """Whether arrays have one precision, and a sum the limits of native/problems.h."""
+    floats = {a.dtype for a in arrays if a.dtype not in (np.int32, np.bool_)}
+    if len(floats) > 1 or not floats <= {np.dtype("float32"), np.dtype("float64")}:
+        return False
+    if basis is None:
+        return True
+    return max(len(basis.weights[0]), len(basis.slopes[0])) <= 9 and len(basis.knots) in (2, 3, 4)
+
+
+BACKENDS: tuple[type[AbstractBackend], ...] = (Native, Cuda)
 """All of them but XLA, at most one a platform. Another one is a class here and its name in this tuple."""
 
 
 def backend(platform: str | None = None) -> AbstractBackend:
-    """Who sums between particles and nodes in what is compiled next, and why: `native`, compiled kernels for CPUs, or
-    `xla`.
+    """Who sums between particles and nodes in what is compiled next, and why: `native`, compiled kernels for CPUs,
+    `cuda`, kernels for NVIDIA's cards, or `xla`.
 
-    The environment variable MPMJAX_BACKEND, `native` or `xla`, chooses when a program is compiled; without it CPUs take
-    the native sums where these were built, and other devices always take XLA's. The two differ by rounding.
+    The environment variable MPMJAX_BACKEND, one of these, chooses when a program is compiled; without it CPUs and cards
+    take their kernels where these were built and can be loaded. They differ by rounding.
 
     Args:
-        platform: the platform of JAX. Default: that of the default device.
+        platform: the platform of JAX, such as cpu or cuda. Default: that of the default device.
 
     Raises:
         ValueError: MPMJAX_BACKEND asks for what there is not.
     """
     asked, platform = os.environ.get(VARIABLE, ""), platform or jax.default_backend()
+    if platform == "gpu" and "rocm" not in jax.devices()[0].client.platform_version.lower():
+        platform = "cuda"  # its name in lowered programs
     names = [*(kind.name for kind in BACKENDS), XLA.name]
     if asked not in ("", *names):
         raise ValueError(f"{VARIABLE} must be {' or '.join(names)}, or not be set, got {asked!r}.")

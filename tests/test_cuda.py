@@ -1,0 +1,190 @@
+"""The sums in CUDA without a card: kernels on the CPU, one thread after the other, and NVRTC's word on their code."""
+
+import ctypes
+import hashlib
+import shutil
+import subprocess
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import thorough
+from test_native import (
+    SIDE,
+    agree,
+    averaged,
+    basis_for,
+    problem,
+    resistance,
+    resisted,
+    resisted_in_parts,
+    summed,
+)
+
+import mpmjax as mpm
+from mpmjax.discretisation import Stencil
+from mpmjax.native import AbstractBackend, _backend, _library
+
+NATIVE = Path(__file__).parents[1] / "native"
+NEEDS_COMPILER = pytest.mark.skipif(shutil.which("c++") is None, reason="there is no C++ compiler")
+NVRTC = [path for path in _library._nvrtc() if Path(path).is_file()]
+NEEDS_NVRTC = pytest.mark.skipif(
+    not (NVRTC and _library.CUDA_PATH.is_file()), reason="there is no NVRTC (nvidia-cuda-nvrtc-cu12), or no library"
+)
+
+
+class OneByOne(AbstractBackend):
+    """The kernels for cards, with a loop over threads in the place of a launch."""
+
+    name = "one by one"
+    platform = "cpu"
+    has = _backend.Cuda.has
+
+    def call(self, kernel, operands, results, attributes, aliases=None):
+        told = {key: np.bool_(value) if isinstance(value, bool) else value for key, value in attributes.items()}
+        return list(jax.ffi.ffi_call(f"one_thread_{kernel}", list(results))(*operands, **told))
+
+
+@pytest.fixture(scope="session")
+def kernels(pytestconfig):
+    """Kernels for a CPU, compiled once and kept in pytest's cache as long as their sources are the same."""
+    names = "check_one_thread.cc", "launches.h", "one_thread.h", "calls.h", "call.h", "kernels.h", "problems.h"
+    sources = b"".join((NATIVE / name).read_bytes() for name in names) + jax.__version__.encode()
+    folder = pytestconfig.cache.mkdir("one_thread")
+    path = folder / f"{hashlib.sha256(sources).hexdigest()[:16]}.so"
+    if not path.is_file():
+        command = ["c++", "-std=c++17", "-shared", "-fPIC", "-Wno-psabi", "-isystem", jax.ffi.include_dir()]
+        subprocess.run([*command, str(NATIVE / names[0]), "-o", str(path)], check=True)
+    handle = ctypes.CDLL(str(path))
+    for name in _library.CUDA_KERNELS:
+        capsule = jax.ffi.pycapsule(getattr(handle, f"mpmjax_{name}"))
+        jax.ffi.register_ffi_target(f"one_thread_{name}", capsule, platform="cpu")
+
+
+@pytest.fixture
+def one_by_one(kernels, choose, monkeypatch):
+    """What a function gives by the kernels for cards, and by XLA; the first must call them."""
+    monkeypatch.setattr(_backend, "BACKENDS", (OneByOne,))
+
+    def both(function, *args):
+        found = []
+        for name in ("one by one", "xla"):
+            choose(name)
+            program = jax.jit(lambda *args: function(*args))
+            assert ("one_thread_" in program.lower(*args).as_text()) == (name == "one by one")
+            found.append(program(*args))
+        return found
+
+    return both
+
+
+CASES = [(d, s, c) for d in (1, 2, 3) for s in (2, 3, 4) for c in (d, d + 1) if (d, s, c) != (2, 3, 3)]
+
+
+@NEEDS_COMPILER
+@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
+@pytest.mark.parametrize(("d", "s", "c"), [(2, 3, 3), *thorough(*CASES, (2, 3, 6), (3, 3, 1))])
+def test_sums_agree(one_by_one, d, s, c, dtype):
+    """With nodes beyond the window, and around periodic axes."""
+    args = problem(d, s, c, 21, dtype)
+
+    def each(first, *floats):
+        around = summed(basis_for(d, s, periodic=True), first % SIDE, *floats)
+        return summed(basis_for(d, s), first, *floats), around
+
+    agree(*one_by_one(each, *args), dtype)
+
+
+@NEEDS_COMPILER
+@pytest.mark.parametrize("d", [1, *thorough(2, 3)])
+def test_sums_agree_whatever_is_given(one_by_one, d):
+    """Of the value, gradients, or both, of fewer columns too; of squares, moved along dt, and in a batch."""
+    args, basis, c = problem(d, 3, 2, 21, "float64"), basis_for(d, 3), 2
+
+    def each(first, t, *floats):
+        squared = Stencil(first, t, jnp.ones(()), jnp.ones(21, bool), basis).squared.basis
+        moved = jax.jvp(lambda t: summed(basis, first, t, *floats), (t,), (jnp.cos(t),))[1]
+        choices = ({"graded": False}, {"valued": False}, {"graded": c - 1})
+        return (
+            [summed(basis, first, t, *floats, **which) for which in choices],
+            summed(squared, first, t, *floats),
+            moved,
+        )
+
+    agree(*one_by_one(each, *args), "float64")
+    pair = [jnp.stack(two) for two in zip(args, problem(d, 3, c, 21, "float64", seed=1), strict=True)]
+    agree(*one_by_one(jax.vmap(partial(summed, basis)), *pair), "float64")
+
+
+@NEEDS_COMPILER
+@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
+def test_averages_and_resistances_agree(one_by_one, d, dtype):
+    """With empty nodes, for no particle, and in a batch."""
+    for p in (30, 0):
+        first, t, given, _ = problem(d, 3, 3, p, dtype)
+        found, expected = one_by_one(averaged, first, t, given[0], given[1:])
+        agree(found, expected, dtype)
+        assert (found[0] == 0).any()
+    args = resistance(d, 30, dtype)
+    found, expected = one_by_one(resisted, *args)
+    agree(found, expected, dtype)
+    agree(found, jax.jit(resisted_in_parts)(*args), dtype)
+    pair = [jnp.stack(two) for two in zip(args, resistance(d, 30, dtype, seed=2), strict=True)]
+    agree(*one_by_one(jax.vmap(resisted), *pair), dtype)
+
+
+@NEEDS_COMPILER
+def test_a_particle_that_is_not_finite_spoils_its_own_nodes_alone(one_by_one):
+    """As in XLA: the same entries are finite."""
+    first, t, given, nodes = problem(2, 3, 3, 20, "float32")
+    found, expected = one_by_one(partial(summed, basis_for(2, 3)), first, t.at[:, 5].set(jnp.nan), given, nodes)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(jnp.isfinite(a), jnp.isfinite(b)), found, expected)
+
+
+@NEEDS_NVRTC
+@pytest.mark.parametrize("card", ["sm_90", *thorough("sm_80", "sm_100")])
+@pytest.mark.parametrize("types", ["float, 3, 3, 4", *thorough("double, 3, 4, 0", "float, 2, 3, 2", "double, 1, 2, 1")])
+def test_nvrtc_compiles_the_kernels(card, types, tmp_path):
+    """For cards of these capabilities, none of which is here; and what was compiled is kept."""
+    library = ctypes.CDLL(str(_library.CUDA_PATH))
+    library.mpmjax_compile.restype = ctypes.c_char_p
+    kernels = {"scatter": "Scatter", "gather": "Gather", "pull": "Pull", "resist": "Resist", "divide": "Average"}
+    for name, of in kernels.items():
+        texts = (text.encode() for text in (NVRTC[0], str(tmp_path), of, name, types))
+        assert library.mpmjax_compile(*texts, 3, card.encode()).decode() == ""
+    assert len(list(tmp_path.glob("*.cubin"))) == len(kernels)
+    broken = [text.encode() for text in (NVRTC[0], str(tmp_path), "Scatter", "nothing", types)]
+    assert "nothing" in library.mpmjax_compile(*broken, 3, card.encode()).decode()
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="there may be a card")
+def test_without_a_card_one_line_says_why_and_xla_sums(choose, monkeypatch, capfd):
+    """`mpmjax info` too; nothing else is said, and asked for it is an error."""
+    monkeypatch.delenv("MPMJAX_BACKEND", raising=False)
+    reason = _backend.Cuda.absence()
+    assert reason
+    assert "\n" not in reason
+    assert str(mpm.native.backend("cuda")) == f"XLA (no cuda library: {reason})"
+    assert mpm.native.backend("rocm").name == "xla"
+    choose("cuda")
+    with pytest.raises(ValueError, match="there is no library of them that can be used"):
+        mpm.native.backend("cuda")
+    assert mpm.native.backend("cpu").name == "xla"
+    assert capfd.readouterr() == ("", "")
+
+
+def test_nvrtc_is_found_in_wheels(monkeypatch, tmp_path):
+    """All that there are, and then where the loader looks: the first that a card takes is taken."""
+    places = [tmp_path / "nvidia" / folder for folder in ("cuda_nvrtc/lib/libnvrtc.so.12", "cu13/lib/libnvrtc.so.13")]
+    for place in places:
+        place.parent.mkdir(parents=True)
+        place.touch()
+    (tmp_path / "nvidia" / "cu13" / "lib" / "libnvrtc-builtins.so.13.0").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    found = list(_library._nvrtc())
+    assert [path for path in found if str(tmp_path) in path] == [str(places[0]), str(places[1])]
+    assert found[-1] == "libnvrtc.so.12"
