@@ -235,6 +235,3 @@ def load(path: str | os.PathLike) -> Run:
         collider_impulse=frames.collider_impulse,
         boundary_impulse=frames.boundary_impulse,
     )
-
-
-_merged = eqx.filter_jit(RunStatistics.merged)
