@@ -51,7 +51,9 @@ class AbstractNodes(eqx.Module):
     brought_by: eqx.AbstractVar[tuple[int | None, ...]]
     """The number of the boundary that brings each contact; None for that of two bodies."""
     loose: eqx.AbstractVar[Any]
-    """The nodes with those of rigid bodies each by itself; None without rigid bodies."""
+    """The nodes before the constraints of bodies; None without any."""
+    tied: eqx.AbstractVar[tuple[Any, ...]]
+    """The maps of these constraints."""
 
     @property
     @abc.abstractmethod
@@ -319,7 +321,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         The mean is within the limit and takes energy, as each is and does. The residual is without the impulses of
         springs.
         """
-        tied, nodes, contacts = Mirror(self.nodes.mirror.rigid), self.nodes, self.unconstrained.contacts
+        tied, nodes, contacts = Mirror(self.nodes.tied), self.nodes, self.unconstrained.contacts
         rubbing = self if nodes.loose is None else replace(self, nodes=nodes.loose)
         pairs = zip(contacts, self.active, strict=True)
         frictions = [contact.friction(rubbing, active, residual) for contact, active in pairs]
@@ -332,7 +334,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             rubbed, by_contact = v, [jnp.zeros_like(v)] * len(contacts)
             for k, friction in (pair for group in order for pair in group):
                 change = friction(tied.unfold(rubbed))
-                if tied.images:  # the impulses on a rigid body's nodes are those on the whole of it
+                if tied.images:  # impulses on the nodes of a constrained body act on the whole of it
                     mass, impulse = nodes.mass[:, None], tied.fold(rubbing.nodes.mass[:, None] * change)
                     change = nodes.projection.combine(jnp.where(mass > 0, impulse / jnp.where(mass > 0, mass, 1), 0), 0)
                 rubbed, by_contact[k] = rubbed + change, change
@@ -343,7 +345,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     def pushes(self, friction_dv: tuple[NodeVector, ...]) -> tuple[tuple[int, NodeVector], ...]:
         """The impulses of boundaries on the nodes by springs and friction [kg m/s], shape (n, d), each with the
         boundary's number, from the change of velocity by the friction of each contact [m/s]."""
-        pushes, nodes, tied = [], self.unconstrained, Mirror(self.nodes.mirror.rigid)
+        pushes, nodes, tied = [], self.unconstrained, Mirror(self.unconstrained.tied)
         mass = (nodes if nodes.loose is None else nodes.loose).mass[:, None]
         for number, contact, active, change in zip(
             nodes.brought_by, nodes.contacts, self.active, friction_dv, strict=True

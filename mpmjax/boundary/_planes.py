@@ -299,7 +299,7 @@ class ContactPlane(AbstractPlane):
     friction: Scalar = 0.0
     plain_box: ClassVar[str] = "SeparatingBox"
     sees_faces: ClassVar[bool] = True
-    meets_rigid_bodies: ClassVar[bool] = False
+    meets_constraints: ClassVar[bool] = False
 
     def __check_init__(self):
         require_fields(self)
