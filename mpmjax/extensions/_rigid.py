@@ -54,6 +54,7 @@ class Rigid(AbstractMaterial):
         )
 
     def constraint(self, number: int, layer: int) -> "RigidConstraint":  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The constraint on how a body of it moves."""
         return RigidConstraint(number, layer, self.free, self.turns)
 
     def energy(self, F: Matrix) -> Array:
