@@ -35,6 +35,15 @@ ActiveSet = tuple[Bool[Array, "..."], ...]
 """The places that are held, one mask for each contact."""
 
 
+class ContactInfo(eqx.Module):
+    """The report of contact: how the active set was found."""
+
+    sweeps: Int[Array, "*f"]
+    """Solves before the last one."""
+    violations: Int[Array, "*f"]
+    """Places that pull or are entered all the same."""
+
+
 class AbstractNodes(eqx.Module):
     """The interface of a step's nodes to contact."""
 
@@ -45,7 +54,7 @@ class AbstractNodes(eqx.Module):
     dt: eqx.AbstractVar[Array]
     """Δt [s]."""
     potential: eqx.AbstractVar[Any]
-    """The potential Φ of the nodes' displacement."""
+    """The potential Φ of the nodes' displacement, with the mirrors of symmetry planes and of columns that are held."""
     contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]
     """The boundaries that may be left."""
     brought_by: eqx.AbstractVar[tuple[int | None, ...]]
@@ -69,11 +78,6 @@ class AbstractNodes(eqx.Module):
     @abc.abstractmethod
     def projection(self) -> Any:
         """The projection on the components that nothing holds."""
-
-    @property
-    @abc.abstractmethod
-    def mirror(self) -> Mirror:
-        """The mirror images of symmetry planes, and of the columns that are held."""
 
     @abc.abstractmethod
     def constrained(self: "N", images: Mirror, mass: NodeScalar, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "N":
@@ -295,7 +299,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         """The part of the residual that holds components of velocity."""
         for contact, active in zip(self.unconstrained.contacts, self.active, strict=True):
             impulse = contact.spring_impulse(self, active)
-            residual = residual if impulse is None else residual - self.unconstrained.mirror.fold(impulse)
+            residual = residual if impulse is None else residual - self.unconstrained.potential.mirror.fold(impulse)
         return residual
 
     def impulse(self, residual: NodeVector) -> NodeVector:
@@ -361,7 +365,7 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     pairs = list(zip(nodes.contacts, active, strict=True))
     walls = tuple(image for contact, mask in pairs for image in contact.images(mask))
     fixed = nodes.conditions.fixed
-    images, mass = with_one_mass(walls, nodes.mass, fixed.shape[1])
+    images, mass = with_one_mass(walls, nodes.mass, fixed.shape[1]) if walls else (Mirror(()), nodes.mass)
     for contact, mask in pairs:
         fixed = fixed | contact.fixed(mask, fixed.shape)
     springs = tuple(term for contact, mask in pairs if (term := contact.springs(mask)) is not None)

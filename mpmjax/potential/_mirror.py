@@ -154,11 +154,9 @@ class Scaling(AbstractImage):
 
 
 def with_one_mass(walls: tuple[WallImage, ...], mass: NodeScalar, dim: int) -> tuple["Mirror", NodeScalar]:
-    """The maps of walls that hold nodes of these masses [kg], shape (n,), with a scaling before them, and the masses
-    folded by them: a node b has the mass Σ m along the wall, and across it Σ B² m by a unit of its velocity; it is
-    scaled so that both are one."""
-    if not walls:
-        return Mirror(()), mass
+    """The maps of walls, one or more, that hold nodes of these masses [kg], shape (n,), with a scaling before them, and
+    the masses folded by them: a node b has the mass Σ m along the wall, and across it Σ B² m by a unit of its velocity;
+    it is scaled so that both are one."""
     masses = jnp.broadcast_to(mass[:, None], (len(mass), dim + 1))
     for wall in reversed(walls):
         masses = wall.fold_masses(masses)

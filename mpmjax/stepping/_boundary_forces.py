@@ -26,7 +26,7 @@ def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator,
     assert colliders is not None
     position, pivots = colliders.position, colliders.pivots
     if share is not None:
-        position = position + share * nodes.dt * nodes.mirror.unfold(new.motion.carrier)
+        position = position + share * nodes.dt * nodes.potential.mirror.unfold(new.motion.carrier)
         pivots = pivots + share * nodes.dt * colliders.pivot_velocity
     held, numbers = new.held(nodes), _boundaries_of_colliders(scene)
     holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
@@ -50,15 +50,15 @@ def impulse_on_boundaries(
     held, force_at = new.held(nodes), method.force_at()
     solved, carrier = new.solved.velocity, new.motion.carrier
     whole, elastic = new.solved, new.elastic
-    if nodes.mirror.images:  # of all nodes
-        whole = jax.tree.map(nodes.mirror.unfold, whole)
+    if nodes.potential.mirror.images:  # of all nodes
+        whole = jax.tree.map(nodes.potential.mirror.unfold, whole)
         elastic = None if unfolded.f is None else method.elastic_impulse(unfolded, whole)
     residual = reaction(unfolded, whole, elastic)
     grid, window, dt = scene.grid, scene.window(particles), nodes.dt
     each = enumerate(scene.boundary)
     images = [(n, image) for n, boundary in each for image in boundary.mirror_images(grid, window, t, dt)]
     contacts = list(zip(nodes.brought_by, nodes.contacts, held.active, strict=True))
-    unfold = nodes.mirror.unfold
+    unfold = nodes.potential.mirror.unfold
     at = scene.nodes(particles, t)
     owners = owners_of(scene.boundary, at, grid.spacing, t, dt, reference=scene.total)
     planes = [(number, image) for number, image in images if isinstance(image, Image)]

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
-from typing import Any
+from typing import Any, NoReturn
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -67,35 +67,28 @@ class Nodes(AbstractNodes):
         Raises:
             ValueError: P2G summed momentum and force together. So for `force` and `acceleration`.
         """
-        return self._apart(self.v)
+        return self.v if self.f is not None else self._refuse()
 
     @property
     def force(self) -> NodeVector:
         """Internal force at the start of the step [N], shape (n, d), with that of explicit viscosity."""
-        return self._apart(self.f)
+        return self.f if self.f is not None else self._refuse()
 
     @property
     def acceleration(self) -> Array:
         """Body acceleration g [m/s²], shape (d,) or (n, d)."""
-        return self._apart(self.g)
+        return self.g if self.f is not None else self._refuse()
 
-    def _apart(self, field: Any) -> Any:
-        if self.f is None:
-            raise ValueError(
-                "P2G summed momentum and forces in one, so v^n, g and the force are not known apart: only "
-                "nodes.explicit_velocity() is. An integrator that uses them must have needs_separate_force = True."
-            )
-        return field
+    def _refuse(self) -> NoReturn:
+        raise ValueError(
+            "P2G summed momentum and forces in one, so v^n, g and the force are not known apart: only "
+            "nodes.explicit_velocity() is. An integrator that uses them must have needs_separate_force = True."
+        )
 
     @property
     def free(self) -> Mask:
         """Whether a component is not prescribed, and its node has mass, shape (n, d)."""
         return self.occupied & ~self.conditions.fixed
-
-    @property
-    def mirror(self) -> Mirror:
-        """The mirror images of symmetry planes, and of the active columns of contact planes."""
-        return self.potential.mirror
 
     @property
     def free_normals(self) -> tuple[FreeNormal, ...]:

@@ -188,7 +188,7 @@ def force_error(
         stays = np.repeat([not law.relaxes_stress for law in scene.laws], trial.sizes)
         if stays.any():
             sums = scatter(nodes.potential.stencil, jnp.where(stays, trial.mass, 0)[None], None, nodes.potential.size)
-            mass = mass + nodes.mirror.fold_scalar(sums[:, 0])
+            mass = mass + nodes.potential.mirror.fold_scalar(sums[:, 0])
     momentum = mass[:, None] * motion.velocity
     norms = [jnp.linalg.norm(a) for a in (exact, elastic, nodes.dt * nodes.force, momentum)]
     return jnp.linalg.norm(exact - elastic) / nodes.dt, reduce(jnp.maximum, norms) / nodes.dt
