@@ -268,8 +268,8 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar
         loose, tied = nodes.folded(images) if images.images else nodes, tuple(image for image, *_ in bodies)
         nodes = loose.folded(Mirror(tied))
         layers = nodes.velocity, nodes.conditions.fixed, nodes.conditions.velocity
-        for image, *own in bodies:
-            layers = [image.with_own(field, layer) for field, layer in zip(layers, own, strict=True)]
+        for image, *parts in bodies:
+            layers = [image.with_own(field, layer) for field, layer in zip(layers, parts, strict=True)]
         v, fixed, prescribed = layers
         conditions = Conditions(fixed, prescribed, nodes.conditions.colliders)
         return replace(nodes, v=v, conditions=conditions, loose=loose, tied=tied)
