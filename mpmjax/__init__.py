@@ -43,6 +43,7 @@ from mpmjax.discretisation import (
     MLSGradient as MLSGradient,
     SplineGradient as SplineGradient,
 )
+from mpmjax.extensions import Rigid as Rigid
 from mpmjax.fitting import (
     Bounded as Bounded,
     Curve as Curve,
@@ -74,7 +75,6 @@ from mpmjax.material import (
     MooneyRivlin as MooneyRivlin,
     NeoHookean as NeoHookean,
     Ogden as Ogden,
-    Rigid as Rigid,
     Snow as Snow,
     Viscous as Viscous,
     VonMises as VonMises,

@@ -9,7 +9,6 @@ import numpy as np
 from mpmjax._types import Array, Float, Matrix, NodeVector, ParticleScalar, Scalar, components
 from mpmjax.checks import canonical, checked, require, require_positive, require_whole
 from mpmjax.discretisation import Gathered, Stencil, gather, scatter
-from mpmjax.geometry import rigid_body
 from mpmjax.implicit import Projection
 from mpmjax.potential import Forces
 from mpmjax.state import Particles, Scene, prepare
@@ -45,11 +44,10 @@ def energy_of(scene: Scene, particles: Particles) -> Energy:
     if scene.transfer.affine and particles.C is not None:
         speed2 = speed2 + (particles.C**2 * scene.stencil(particles).moment.T[:, None, :]).sum(axis=(1, 2))
     kinetic = particles.mass * speed2 / 2
-    for material in scene.rigid_bodies:
-        rows = slice(*particles.groups[material.number].rows)
-        body = rigid_body(particles.x[rows], particles.v[rows], particles.mass[rows], particles.volume[rows])
-        rigid = (body.mass * (body.velocity**2).sum() + body.spin @ body.inertia @ body.spin) / 2
-        kinetic = kinetic.at[rows].set(0).at[rows.start].set(rigid)
+    for constraint in scene.constraints:
+        rows = slice(*particles.groups[constraint.number].rows)
+        fields = (particles.x, particles.v, particles.mass, particles.volume)
+        kinetic = kinetic.at[rows].set(0).at[rows.start].set(constraint.kinetic_energy(*(a[rows] for a in fields)))
     gravity = jnp.asarray(scene.gravity, particles.x.dtype)
     return Energy(
         kinetic=kinetic.sum(),
@@ -227,13 +225,16 @@ def budget(
         the particles after the last step, and the budget, each of its terms with a leading axis f.
 
     Raises:
-        ValueError: from `prepare`, a step that is not positive, a plane of symmetry that moves, or a rigid body.
+        ValueError: from `prepare`, a step that is not positive, a plane of symmetry that moves, or a body under a
+            constraint, such as a rigid one.
     """
     require_positive("dt [s]", dt, particles.x.dtype)
     steps, start = require_whole("steps", steps, 1), require_whole("start", start, 0)
+    constrained = [scene.laws[constraint.number].title() for constraint in scene.constraints]
     require(
-        not scene.rigid_bodies,
-        "A budget does not know how a Rigid body moves: ask for energy and momentum, or give the body a stiff law.",
+        not constrained,
+        f"A budget does not know how a {' or '.join(constrained)} body moves: ask for energy and momentum, or give the "
+        "body a stiff law.",
     )
     require(
         not scene.moving_mirrors,

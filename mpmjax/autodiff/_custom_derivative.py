@@ -191,15 +191,12 @@ class _Call(NamedTuple):
 
 
 def _evaluate(call: _Call, *arrays: Array, unroll: bool = False) -> Any:
+    if call.mapped:  # the outer axes first
+        member = partial(_evaluate, call._replace(mapped=call.mapped[:-1]), unroll=unroll)
+        return jax.vmap(member, in_axes=call.mapped[-1])(*arrays)
     told = dict(call.params) | ({"unroll": True} if unroll and call.function.unrolls else {})
-
-    def value(arrays: tuple[Array, ...]) -> Any:
-        with ranks_may_differ():
-            return call.function.function(*call.args(arrays), **told)
-
-    for axes in call.mapped:
-        value = jax.vmap(value, in_axes=(axes,))
-    return value(arrays)
+    with ranks_may_differ():
+        return call.function.function(*call.args(arrays), **told)
 
 
 _evaluated = jax.jit(_evaluate, static_argnums=0, static_argnames="unroll")  # traced once for arrays of the same shapes

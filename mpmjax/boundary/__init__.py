@@ -1,6 +1,5 @@
 """Walls, grips, mirrored planes and colliders, and the impulses that they receive."""
 
-from mpmjax.boundary._active_set import ContactInfo as ContactInfo, find_active_set as find_active_set
 from mpmjax.boundary._body_contact import (
     STIFFNESS as STIFFNESS,
     Body as Body,
@@ -30,7 +29,9 @@ from mpmjax.boundary._contact import (
     AbstractContact as AbstractContact,
     AbstractNodes as AbstractNodes,
     AbstractSpringContact as AbstractSpringContact,
+    ActiveSet as ActiveSet,
     ConstrainedNodes as ConstrainedNodes,
+    ContactInfo as ContactInfo,
     constrain as constrain,
     count_places as count_places,
 )

@@ -229,7 +229,7 @@ class BodyContact(AbstractSpringContact):
     ) -> Callable[[NodeVector], NodeVector]:
         """Opposite impulses on the two bodies, at most as large as those that stop their slip."""
         push, count = jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0), len(self.gap)
-        layers = held.nodes.mirror.fold_scalar(jnp.tile(push, len(residual) // count)).reshape(-1, count)
+        layers = held.nodes.potential.mirror.fold_scalar(jnp.tile(push, len(residual) // count)).reshape(-1, count)
         limit = self.coefficient * layers[self.pair[0]]
         mass = held.nodes.mass.reshape(-1, count)
         first, second = (mass[body] for body in self.pair)

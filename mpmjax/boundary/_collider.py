@@ -119,7 +119,7 @@ class StickyCollider(AbstractCollider):
 
     shape: AbstractRegion
     motion: AbstractMotion | None = None
-    meets_rigid_bodies: ClassVar[bool] = False
+    meets_constraints: ClassVar[bool] = False
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = v_c."""
@@ -143,7 +143,7 @@ class SlipCollider(AbstractCollider):
 
     shape: AbstractRegion
     motion: AbstractMotion | None = None
-    meets_rigid_bodies: ClassVar[bool] = False
+    meets_constraints: ClassVar[bool] = False
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """In the total description its normal must be the same everywhere and always."""

@@ -35,6 +35,15 @@ ActiveSet = tuple[Bool[Array, "..."], ...]
 """The places that are held, one mask for each contact."""
 
 
+class ContactInfo(eqx.Module):
+    """The report of contact: how the active set was found."""
+
+    sweeps: Int[Array, "*f"]
+    """Solves before the last one."""
+    violations: Int[Array, "*f"]
+    """Places that pull or are entered all the same."""
+
+
 class AbstractNodes(eqx.Module):
     """The interface of a step's nodes to contact."""
 
@@ -45,13 +54,15 @@ class AbstractNodes(eqx.Module):
     dt: eqx.AbstractVar[Array]
     """Δt [s]."""
     potential: eqx.AbstractVar[Any]
-    """The potential Φ of the nodes' displacement."""
+    """The potential Φ of the nodes' displacement, with the mirrors of symmetry planes and of columns that are held."""
     contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]
     """The boundaries that may be left."""
     brought_by: eqx.AbstractVar[tuple[int | None, ...]]
     """The number of the boundary that brings each contact; None for that of two bodies."""
     loose: eqx.AbstractVar[Any]
-    """The nodes with those of rigid bodies each by itself; None without rigid bodies."""
+    """The nodes before the constraints of bodies; None without any."""
+    tied: eqx.AbstractVar[tuple[Any, ...]]
+    """The maps of these constraints."""
 
     @property
     @abc.abstractmethod
@@ -67,11 +78,6 @@ class AbstractNodes(eqx.Module):
     @abc.abstractmethod
     def projection(self) -> Any:
         """The projection on the components that nothing holds."""
-
-    @property
-    @abc.abstractmethod
-    def mirror(self) -> Mirror:
-        """The mirror images of symmetry planes, and of the columns that are held."""
 
     @abc.abstractmethod
     def constrained(self: "N", images: Mirror, mass: NodeScalar, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "N":
@@ -293,7 +299,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         """The part of the residual that holds components of velocity."""
         for contact, active in zip(self.unconstrained.contacts, self.active, strict=True):
             impulse = contact.spring_impulse(self, active)
-            residual = residual if impulse is None else residual - self.unconstrained.mirror.fold(impulse)
+            residual = residual if impulse is None else residual - self.unconstrained.potential.mirror.fold(impulse)
         return residual
 
     def impulse(self, residual: NodeVector) -> NodeVector:
@@ -319,7 +325,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         The mean is within the limit and takes energy, as each is and does. The residual is without the impulses of
         springs.
         """
-        tied, nodes, contacts = Mirror(self.nodes.mirror.rigid), self.nodes, self.unconstrained.contacts
+        tied, nodes, contacts = Mirror(self.nodes.tied), self.nodes, self.unconstrained.contacts
         rubbing = self if nodes.loose is None else replace(self, nodes=nodes.loose)
         pairs = zip(contacts, self.active, strict=True)
         frictions = [contact.friction(rubbing, active, residual) for contact, active in pairs]
@@ -332,7 +338,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             rubbed, by_contact = v, [jnp.zeros_like(v)] * len(contacts)
             for k, friction in (pair for group in order for pair in group):
                 change = friction(tied.unfold(rubbed))
-                if tied.images:  # the impulses on a rigid body's nodes are those on the whole of it
+                if tied.images:  # impulses on the nodes of a constrained body act on the whole of it
                     mass, impulse = nodes.mass[:, None], tied.fold(rubbing.nodes.mass[:, None] * change)
                     change = nodes.projection.combine(jnp.where(mass > 0, impulse / jnp.where(mass > 0, mass, 1), 0), 0)
                 rubbed, by_contact[k] = rubbed + change, change
@@ -343,7 +349,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     def pushes(self, friction_dv: tuple[NodeVector, ...]) -> tuple[tuple[int, NodeVector], ...]:
         """The impulses of boundaries on the nodes by springs and friction [kg m/s], shape (n, d), each with the
         boundary's number, from the change of velocity by the friction of each contact [m/s]."""
-        pushes, nodes, tied = [], self.unconstrained, Mirror(self.nodes.mirror.rigid)
+        pushes, nodes, tied = [], self.unconstrained, Mirror(self.unconstrained.tied)
         mass = (nodes if nodes.loose is None else nodes.loose).mass[:, None]
         for number, contact, active, change in zip(
             nodes.brought_by, nodes.contacts, self.active, friction_dv, strict=True
@@ -359,7 +365,7 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     pairs = list(zip(nodes.contacts, active, strict=True))
     walls = tuple(image for contact, mask in pairs for image in contact.images(mask))
     fixed = nodes.conditions.fixed
-    images, mass = with_one_mass(walls, nodes.mass, fixed.shape[1])
+    images, mass = with_one_mass(walls, nodes.mass, fixed.shape[1]) if walls else (Mirror(()), nodes.mass)
     for contact, mask in pairs:
         fixed = fixed | contact.fixed(mask, fixed.shape)
     springs = tuple(term for contact, mask in pairs if (term := contact.springs(mask)) is not None)

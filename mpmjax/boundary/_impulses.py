@@ -21,7 +21,7 @@ from mpmjax.boundary._boundary import AbstractBoundary
 from mpmjax.boundary._conditions import OwnedImpulse
 from mpmjax.geometry import moment
 from mpmjax.linalg import pairs
-from mpmjax.potential import Image, Mirror, Tie, WallImage
+from mpmjax.potential import Image, Mirror, WallImage
 
 
 class Impulses(eqx.Module):
@@ -53,7 +53,7 @@ def no_impulses(count: int, dim: int, dtype: Any) -> Impulses:
 
 
 class OwnedCouple(eqx.Module):
-    """A couple on a rigid body, and the boundary that gives it."""
+    """A couple on a constrained body, and the boundary that gives it."""
 
     moment: Float[Array, "r"]
     """[kg m²/s], shape (r,)."""
@@ -68,7 +68,7 @@ def received_impulses(
     couples: Sequence[OwnedCouple] = (),
 ) -> Impulses:
     """The impulse on each collider or boundary, minus the parts that it gives the nodes and the couples that it gives
-    rigid bodies, from the positions of the nodes and the points for torques [m]."""
+    bodies, from the positions of the nodes and the points for torques [m]."""
 
     def on(number: int, pivot: Array) -> tuple[Array, Array]:
         total = jnp.zeros_like(positions)
@@ -105,9 +105,7 @@ def owners_of(
     return owners
 
 
-def taken_by_mirrors(
-    field: NodeVector, images: list[tuple[int, WallImage]] | list[tuple[int, Image | Tie]]
-) -> tuple[list[OwnedImpulse], NodeVector]:
+def taken_by_mirrors(field: NodeVector, images: Sequence[tuple[int, Any]]) -> tuple[list[OwnedImpulse], NodeVector]:
     """The part of impulses on all nodes [kg m/s], shape (n, d), that mirrors take, and the impulses that remain on true
     nodes. The mirrors come in the order in which they unfold, with their boundaries' numbers.
 

@@ -191,7 +191,7 @@ class PlaneContact(AbstractContact):
     def known_at_start(self, nodes: AbstractNodes) -> bool:
         """Where nothing across another axis and no other boundary moves the nodes of a column."""
         planes = (contact for contact in nodes.contacts if isinstance(contact, PlaneContact))
-        alone = all(plane.axis == self.axis for plane in planes) and not nodes.mirror.images
+        alone = all(plane.axis == self.axis for plane in planes) and not nodes.potential.mirror.images
         return alone and not nodes.conditions.holds
 
     def images(self, active: Array) -> tuple[WallImage, ...]:
@@ -251,7 +251,7 @@ class PlaneContact(AbstractContact):
         """A quantity of the columns, summed over columns that are each other's image in other planes."""
         nodes = held.unconstrained
         walls = (wall for contact in nodes.contacts if isinstance(contact, PlaneContact) for wall in contact.walls)
-        for image in (*walls, *nodes.mirror.images):
+        for image in (*walls, *nodes.potential.mirror.images):
             if isinstance(image, Image | WallImage) and image.axis != self.axis:
                 columns = image.united(columns)
         return columns
@@ -299,7 +299,7 @@ class ContactPlane(AbstractPlane):
     friction: Scalar = 0.0
     plain_box: ClassVar[str] = "SeparatingBox"
     sees_faces: ClassVar[bool] = True
-    meets_rigid_bodies: ClassVar[bool] = False
+    meets_constraints: ClassVar[bool] = False
 
     def __check_init__(self):
         require_fields(self)

@@ -217,7 +217,7 @@ class SurfaceContact(AbstractSpringContact):
         self, held: ConstrainedNodes, active: Array, residual: NodeVector
     ) -> Callable[[NodeVector], NodeVector]:
         pushes, (size, d) = jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0), residual.shape
-        push, mirror = pushes.sum(axis=0), held.nodes.mirror
+        push, mirror = pushes.sum(axis=0), held.nodes.potential.mirror
         around = [(self.coefficient * push)[None]]
         if self.axis is None:
             velocity = jnp.zeros_like(self.normal) if self.velocity is None else self.velocity

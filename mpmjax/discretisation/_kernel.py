@@ -51,12 +51,7 @@ class BSpline(eqx.Module):
     def weights(self, f: Array) -> Array:
         """Weights of the order + 1 nodes along each axis [-], shape (d, order + 1, p), at a distance f from the first
         node in spacings, shape (d, p)."""
-        return around_knots(self.pieces, self.knots, f - self.centre)
-
-    @property
-    def centre(self) -> float:
-        """The middle of the distances f from a first node in which the others follow, in spacings."""
-        return self.order / 2
+        return around_knots(self.pieces, self.knots, f - self.order / 2)
 
     @property
     def knots(self) -> Float[np.ndarray, "s"]:
@@ -65,7 +60,7 @@ class BSpline(eqx.Module):
 
     @property
     def pieces(self) -> Float[np.ndarray, "s k"]:
-        """Coefficients c of the weights as polynomials Σ_k c_ik (f − centre − τ_i)^k, shape (order + 1, order + 1)."""
+        """Coefficients c of the weights as polynomials Σ_k c_ik (f − order/2 − τ_i)^k, shape (order + 1, order + 1)."""
         match self.order:
             case 1:
                 return np.array([[0.0, -1], [0, 1]])
@@ -85,7 +80,7 @@ class BSpline(eqx.Module):
         The linear kernel, whose variance vanishes at nodes, has the slopes."""
         if self.order == 1:
             return self.slopes
-        arms = [(node - self.centre - knot, -1.0) for node, knot in enumerate(self.knots)]
+        arms = [(node - self.order / 2 - knot, -1.0) for node, knot in enumerate(self.knots)]
         pairs = zip(self.pieces, arms, strict=True)
         return np.array([np.polynomial.polynomial.polymul(*both) for both in pairs]) / VARIANCE[self.order]
 

@@ -225,7 +225,7 @@ def make_stencil(
     """
     dx = jnp.asarray(grid.spacing, x.dtype)
     xi = components(x) / dx
-    offset = materialised(xi - jax.lax.stop_gradient(kernel.base(xi)) - kernel.centre)
+    offset = materialised(xi - jax.lax.stop_gradient(kernel.base(xi)) - kernel.order / 2)
     first = first_nodes(kernel, grid, window, xi)
     if layer is not None:
         first = first.at[0].add(jnp.asarray(layer * grid.shape[0], jnp.int32))

@@ -89,7 +89,7 @@ class ParticleStiffness(AbstractHessianAction):
             elastic = elastic if share is None else elastic + share
         shares = [part.diagonal(self.stencil, size) for part in self.others]
         total = scattered([Forces(slopes=jnp.maximum(elastic, 0)), *shares], self.stencil.squared, size)
-        return self.mirror.fold_scalars(total) if self.mirror.images else total
+        return self.mirror.fold_scalar(total) if self.mirror.images else total
 
     def damped(self, potential: ElasticPotential, rate: Scalar) -> "ParticleStiffness":
         """H + r D, with r = `rate` [1/s] and D [N s/m] the positive semi-definite matrix of the potential's viscous

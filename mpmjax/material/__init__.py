@@ -27,10 +27,8 @@ from mpmjax.material._law import (
     AbstractLaw as AbstractLaw,
     AbstractMaterial as AbstractMaterial,
     DeformationMeasure as DeformationMeasure,
-    Freedom as Freedom,
     Viscosity as Viscosity,
 )
-from mpmjax.material._rigid import Rigid as Rigid
 from mpmjax.material._rubber import (
     AbstractRubber as AbstractRubber,
     Gent as Gent,

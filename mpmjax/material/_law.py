@@ -70,20 +70,6 @@ DEFORMATION_GRADIENT = DeformationMeasure(2, "F", "deformation gradient", "det F
 VOLUME_RATIO = DeformationMeasure(0, "J", "volume", "J", "|div v|")
 
 
-class Freedom(NamedTuple):
-    """Degrees of freedom of a rigid body."""
-
-    directions: tuple[bool, ...] | None
-    """Whether it may move in each direction; None for all of them."""
-    turns: bool
-    """Whether it may turn."""
-
-    @property
-    def guided(self) -> bool:
-        """Whether any degree of freedom is fixed."""
-        return not self.turns or not all(self.directions or ())
-
-
 class Viscosity(eqx.Module):
     """A Newtonian viscous stress, linear in the velocity gradient L = ∇_x v."""
 
@@ -118,8 +104,9 @@ class AbstractLaw(eqx.Module):
     """Whether its return map changes the stress, so that implicit solves resist by another one than the law's."""
     viscosity: ClassVar[Viscosity | None] = None
     """The viscosity beside the law."""
-    freedom: ClassVar[Freedom | None] = None
-    """Degrees of freedom of a rigid body; None for deformable laws."""
+    constraint: ClassVar[Any] = None
+    """The constraint on how a body of it moves, an `mpmjax.state.AbstractConstraint`, as a method of the material's
+    number and of its layer of nodes. None of what deforms freely."""
 
     @property
     def flows(self) -> bool:

@@ -40,7 +40,7 @@ class Viscous(AbstractLaw):
     def __check_init__(self):
         require_fields(self)
         require(self.law.viscosity is None, "Viscous takes a law that is not viscous yet: add the viscosities.")
-        require(self.law.freedom is None, "Viscous takes a law that deforms, and a rigid body has nothing that flows.")
+        require(self.law.constraint is None, "Viscous takes a law that deforms: a rigid body has nothing that flows.")
         require_between("Viscous's shear_viscosity [Pa s]", self.shear_viscosity, 0, float("inf"))
         require_between("Viscous's bulk_viscosity [Pa s]", self.bulk_viscosity, 0, float("inf"))
 

@@ -1,10 +1,10 @@
 """The nodes' potential in a step: its terms, and the mirrors on which nodes are folded."""
 
 from mpmjax.potential._mirror import (
+    AbstractImage as AbstractImage,
     Image as Image,
     Mirror as Mirror,
     MirrorPlace as MirrorPlace,
-    RigidImage as RigidImage,
     Tie as Tie,
     carried_by as carried_by,
     mirror_image as mirror_image,

@@ -3,14 +3,15 @@
 Nodes beyond such a plane are signed copies of those before it. With B the map from true nodes to all nodes, masses,
 momenta and forces are folded with Bᵀ and velocities unfolded with B, so that every system keeps its symmetry: the
 implicit one is Bᵀ(M + βΔt²H)B. The transfers know nothing of it. At a `SymmetryPlane` B is always that of the plane; at
-a wall that may be left only in the *columns* (lines of nodes along the normal) that it holds. Rigid parts and bodies
-are such maps too.
+a wall that may be left only in the *columns* (lines of nodes along the normal) that it holds. What ties the nodes of a
+body together is such a map too.
 """
 
+import abc
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,7 +21,7 @@ from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector,
 from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import require
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import Motion, spinning
+from mpmjax.geometry import Motion
 from mpmjax.potential._wall_image import WallImage
 
 
@@ -54,7 +55,27 @@ def _(places: tuple[Array, ...], changes: tuple[Any, ...]) -> tuple[Array, Any]:
     return carried_by(*places), moved[0] if moved else None
 
 
-class Image(eqx.Module):
+class AbstractImage(eqx.Module):
+    """A linear map B of fields from true nodes to all nodes, or of one set of nodes to another."""
+
+    @abc.abstractmethod
+    def scalar(self, field: NodeScalar) -> NodeScalar:
+        """B for an even scalar field, such as mass."""
+
+    @abc.abstractmethod
+    def vector(self, field: NodeVector) -> NodeVector:
+        """B for a vector field."""
+
+    def fold_scalar(self, field: Array) -> Array:
+        """Bᵀ for an even scalar field, shape (n,), or for several in columns, shape (n, c)."""
+        return transposed(self.scalar if field.ndim == 1 else jax.vmap(self.scalar, 1, 1), field)
+
+    def fold(self, field: NodeVector) -> NodeVector:
+        """Bᵀ for a vector field."""
+        return transposed(self.vector, field)
+
+
+class Image(AbstractImage):
     """Signed copies of true nodes at their mirror images, along one axis of the window."""
 
     shape: tuple[int, ...] = eqx.field(static=True)
@@ -77,7 +98,6 @@ class Image(eqx.Module):
         return self.layers * math.prod(self.shape)
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
-        """B for an even scalar field."""
         return self._even(field.reshape(self.layers, *self.shape, 1)).reshape(field.shape)
 
     def united(self, blocks: Array) -> Array:
@@ -98,6 +118,10 @@ class Image(eqx.Module):
             return copied
         return copied + jnp.where(self.normal(self.odd <= 0, field.shape[1]), field, 0)
 
+    def fold(self, field: NodeVector) -> NodeVector:
+        at_rest = replace(self, velocity=None)  # what it adds is no part of the linear map
+        return transposed(at_rest.vector, field)
+
     def normal(self, along: Bool[Array, "m"], dim: int) -> Mask:
         """The normal component of some nodes along the axis, as a mask of shape (n, d)."""
         return self.along(along)[:, None] & (jnp.arange(dim) == self.axis)
@@ -116,28 +140,23 @@ class Image(eqx.Module):
         return copied * sign.reshape(by_axis).astype(blocks.dtype)
 
 
-class Scaling(eqx.Module):
+class Scaling(AbstractImage):
     """A factor of each component of velocity, by which nodes that walls tie to others have one mass for all of them."""
 
     factor: NodeVector
     """Shape (n, d) [-]."""
-    axis: ClassVar[int] = -1
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
-        """Scalars are as they are."""
         return field
 
     def vector(self, field: NodeVector) -> NodeVector:
-        """The field times the factor."""
         return self.factor * field
 
 
 def with_one_mass(walls: tuple[WallImage, ...], mass: NodeScalar, dim: int) -> tuple["Mirror", NodeScalar]:
-    """The maps of walls that hold nodes of these masses [kg], shape (n,), with a scaling before them, and the masses
-    folded by them: a node b has the mass Σ m along the wall, and across it Σ B² m by a unit of its velocity; it is
-    scaled so that both are one."""
-    if not walls:
-        return Mirror(()), mass
+    """The maps of walls, one or more, that hold nodes of these masses [kg], shape (n,), with a scaling before them, and
+    the masses folded by them: a node b has the mass Σ m along the wall, and across it Σ B² m by a unit of its velocity;
+    it is scaled so that both are one."""
     masses = jnp.broadcast_to(mass[:, None], (len(mass), dim + 1))
     for wall in reversed(walls):
         masses = wall.fold_masses(masses)
@@ -152,71 +171,23 @@ def transposed(linear: Callable[[Array], Array], field: Array) -> Array:
     return jax.linear_transpose(linear, field)(field)[0]
 
 
-class Tie(eqx.Module):
+class Tie(AbstractImage):
     """One velocity for several nodes, that of the first: the map B of a rigid part."""
 
     tied: Bool[Array, "n"]
     """The nodes tied together."""
-    axis: ClassVar[int] = -1
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
-        """B for a scalar field."""
         return jnp.where(self.tied, field[jnp.argmax(self.tied)], field)
 
     def vector(self, field: NodeVector) -> NodeVector:
-        """B for a vector field."""
         return jnp.where(self.tied[:, None], field[jnp.argmax(self.tied)], field)
-
-
-class RigidImage(eqx.Module):
-    """The velocities V + ω × r_i of the nodes of a rigid body, which has a layer of nodes of its own, from two of them:
-    the first has V and the second s = Gω, with GᵀG = I/M, so that both have the mass M."""
-
-    layer: int = eqx.field(static=True)
-    layers: int = eqx.field(static=True)
-    arms: Float[Array, "m d"]
-    """r_i = x_i − c [m], shape (m, d)."""
-    per_root: Float[Array, "r r"]
-    """G⁻¹ [1/m]."""
-    axis: ClassVar[int] = -1
-
-    def spin(self, s: Float[Array, "d"]) -> Float[Array, "r"]:
-        """ω [rad/s] from the velocity of the second node [m/s]."""
-        return self.per_root @ s[: len(self.per_root)]
-
-    def own(self, field: Array) -> Array:
-        """The part of a field of all nodes that is of its layer, shape (m, ...)."""
-        return field.reshape(self.layers, len(self.arms), *field.shape[1:])[self.layer]
-
-    def with_own(self, field: Array, layer: Array) -> Array:
-        """The field with that part replaced."""
-        return field.reshape(self.layers, *layer.shape).at[self.layer].set(layer).reshape(field.shape)
-
-    def scalar(self, field: NodeScalar) -> NodeScalar:
-        """A map whose transpose gives both nodes the whole mass."""
-        layer = self.own(field)
-        return self.with_own(field, jnp.broadcast_to(layer[0] + layer[1], layer.shape))
-
-    def vector(self, field: NodeVector) -> NodeVector:
-        """B for a vector field."""
-        layer = self.own(field)
-        return self.with_own(field, layer[0] + spinning(self.spin(layer[1]), self.arms))
-
-    def angular(self, momentum: Float[Array, "d"]) -> Float[Array, "r"]:
-        """Iω = Gᵀ M s [kg m²/s] from M s [kg m/s] of the second node."""
-        rank = len(self.per_root)
-        return jnp.linalg.solve(self.per_root.T, momentum[:rank]) if rank else momentum[:0]
-
-    def reaches(self, plane: Image, mass: NodeScalar) -> Bool[Array, "d"]:
-        """The axis of a plane on or beyond which the body has mass [kg], shape (n,), as a mask of the directions."""
-        there = self.own(plane.along(plane.odd <= 0)) & (self.own(mass) > 0)
-        return there.any() & (jnp.arange(self.arms.shape[1]) == plane.axis)
 
 
 class Mirror(eqx.Module):
     """The mirrors of several planes: `unfold` applies B, from true nodes to all nodes; `fold` applies Bᵀ."""
 
-    images: tuple[Image | WallImage | Scaling | Tie | RigidImage, ...]
+    images: tuple[AbstractImage | WallImage, ...]
 
     def unfold(self, field: NodeVector) -> NodeVector:
         """B v: fill in the mirror images."""
@@ -227,11 +198,7 @@ class Mirror(eqx.Module):
     def fold(self, field: NodeVector) -> NodeVector:
         """Bᵀ f: add to the true nodes what their mirror images received, and leave nothing on the others."""
         for image in reversed(self.images):
-            if isinstance(image, WallImage):
-                field = image.fold(field)
-            else:
-                at_rest = replace(image, velocity=None) if isinstance(image, Image) else image
-                field = transposed(at_rest.vector, field)
+            field = image.fold(field)
         return field
 
     @property
@@ -260,17 +227,10 @@ class Mirror(eqx.Module):
             field = image.scalar(field)
         return field
 
-    def fold_scalar(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
-        """Bᵀ for an even scalar."""
+    def fold_scalar(self, field: Array) -> Array:
+        """Bᵀ for an even scalar, shape (n,), or for several in columns, shape (n, c)."""
         for image in reversed(self.images):
-            field = image.fold_scalar(field) if isinstance(image, WallImage) else transposed(image.scalar, field)
-        return field
-
-    def fold_scalars(self, field: Float[Array, "n c"]) -> Float[Array, "n c"]:
-        """Bᵀ for even scalars in columns."""
-        for image in reversed(self.images):
-            columns = jax.vmap(image.scalar, in_axes=1, out_axes=1)
-            field = image.fold_scalar(field) if isinstance(image, WallImage) else transposed(columns, field)
+            field = image.fold_scalar(field)
         return field
 
     def continued(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
@@ -282,13 +242,8 @@ class Mirror(eqx.Module):
         return field
 
     def without_ties(self) -> "Mirror":
-        """The mirrors without rigid parts and bodies."""
+        """The mirrors alone, without what ties nodes of one body together."""
         return Mirror(tuple(image for image in self.images if isinstance(image, Image)))
-
-    @property
-    def rigid(self) -> tuple[RigidImage, ...]:
-        """The maps of rigid bodies."""
-        return tuple(image for image in self.images if isinstance(image, RigidImage))
 
 
 def mirror_image(axis: int, position: Scalar, keep: str, grid: Grid, window: Int[Array, "d"]) -> Image:

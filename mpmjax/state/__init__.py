@@ -7,6 +7,10 @@ from mpmjax.state._attachment import (
     Patch as Patch,
     PointsAt as PointsAt,
 )
+from mpmjax.state._constraint import (
+    AbstractConstraint as AbstractConstraint,
+    AbstractLayerImage as AbstractLayerImage,
+)
 from mpmjax.state._fill import fill as fill, fill_mapped as fill_mapped
 from mpmjax.state._loads import (
     AbstractBodyForce as AbstractBodyForce,
@@ -45,7 +49,6 @@ from mpmjax.state._preparation import (
 from mpmjax.state._scene import (
     AbstractDescription as AbstractDescription,
     Bodies as Bodies,
-    RigidMaterial as RigidMaterial,
     Scene as Scene,
     TotalLagrangian as TotalLagrangian,
     UpdatedLagrangian as UpdatedLagrangian,

@@ -229,15 +229,9 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"Every particle's stencil must lie in the window; particle {first} at {x[first]} and "
             f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
         )
-    for body in scene.rigid_bodies:
-        x = np.asarray(particles.x[slice(*particles.groups[body.number].rows)], float)
-        spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
-        most = min(len(spread), particles.dim - 1)
-        require(
-            most == particles.dim - 1 and spread[:most] > 1e-6 * float(scene.grid.spacing),
-            f"A Rigid body's particles must not lie {'at one point' if particles.dim < 3 else 'on one line'}, by which "
-            f"nothing says how it turns: give material {body.number} more of them.",
-        )
+    for constraint in scene.constraints:
+        rows = slice(*particles.groups[constraint.number].rows)
+        constraint.check_particles(np.asarray(particles.x[rows], float), float(scene.grid.spacing))
     for law, group, allowed in zip(scene.laws, particles.groups, admissible, strict=True):
         kept, first = law.measure, int(np.argmin(allowed)) + group.rows[0]
         require(

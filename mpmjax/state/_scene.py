@@ -1,7 +1,7 @@
 """The scene: everything that a step needs and does not change, with its description and its bodies."""
 
 from dataclasses import replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -32,8 +32,9 @@ from mpmjax.discretisation import (
     without_empty,
 )
 from mpmjax.geometry import Motion
-from mpmjax.material import AbstractLaw, Freedom
+from mpmjax.material import AbstractLaw
 from mpmjax.potential import MirrorPlace, carried_by
+from mpmjax.state._constraint import AbstractConstraint
 from mpmjax.state._loads import AbstractBodyForce, AbstractLoad
 from mpmjax.state._material_points import AveragedVolume, MaterialPoints, VolumeAverage, volume_average
 from mpmjax.state._particles import Particles, State, with_state
@@ -111,14 +112,6 @@ class Bodies(eqx.Module):
             "material, or drop bodies.",
         )
         return numbers
-
-
-class RigidMaterial(NamedTuple):
-    """A material that is a rigid body."""
-
-    number: int  # index among the scene's materials
-    layer: int  # the layer of nodes that it moves
-    freedom: Freedom  # degrees of freedom
 
 
 class Scene(eqx.Module):
@@ -245,35 +238,8 @@ class Scene(eqx.Module):
             )
         if self.volume is not None:
             self.volume.check(self.laws)
-        if not (rigid := self.rigid_bodies):
-            return
-        require(
-            not self.total,
-            "A Rigid body needs nodes of its own, which the total description has not: use the updated one, or "
-            "RigidPart.",
-        )
-        numbers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
-        require(
-            all(numbers.count(body.layer) == 1 for body in rigid),
-            "A Rigid body must be of one material alone, and no other material of its body: give the scene bodies, "
-            f"Bodies() or with of_materials in which its number appears once, got {numbers}.",
-        )
-        refused = [type(boundary).__name__ for boundary in self.boundary if not boundary.meets_rigid_bodies]
-        require(
-            not refused,
-            f"{', '.join(refused)} cannot stand in a scene with a Rigid body: take a SeparatingBox, a "
-            "SeparatingCollider, or a Grip.",
-        )
-        require(
-            not self.moving_mirrors,
-            "A SymmetryPlane that moves cannot stand in a scene with a Rigid body: take a SeparatingCollider, or a "
-            "plane at rest.",
-        )
-        for directions in (body.freedom.directions for body in rigid):
-            require(
-                directions is None or len(directions) == self.grid.dim,
-                f"Rigid's free directions must be {self.grid.dim} bools, as the grid has directions, got {directions}.",
-            )
+        for constraint in self.constraints:
+            constraint.check(self)
 
     @property
     def laws(self) -> tuple[AbstractLaw, ...]:
@@ -287,16 +253,20 @@ class Scene(eqx.Module):
         return tuple(f"{name} ({law})" for name, law in zip(self.names, laws, strict=True)) if self.names else laws
 
     @property
-    def rigid_bodies(self) -> tuple[RigidMaterial, ...]:
-        """The materials that are rigid bodies."""
-        layers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
-        each = enumerate(zip(self.laws, layers, strict=True))
-        return tuple(RigidMaterial(n, layer, f) for n, (law, layer) in each if (f := law.freedom) is not None)
+    def layers(self) -> tuple[int, ...]:
+        """The number of the layer of nodes of each material."""
+        return (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
+
+    @property
+    def constraints(self) -> tuple[AbstractConstraint, ...]:
+        """The constraints on how bodies move, which their laws bring."""
+        constrained = [n for n, law in enumerate(self.laws) if law.constraint is not None]
+        return tuple(self.laws[n].constraint(n, self.layers[n]) for n in constrained)
 
     @property
     def guides(self) -> dict[int, int]:
-        """Report index of each rigid body's guide, keyed by material; guides follow the boundaries."""
-        guided = [body.number for body in self.rigid_bodies if body.freedom.guided]
+        """Report index of each constraint that holds its body, keyed by material; they follow the boundaries."""
+        guided = [constraint.number for constraint in self.constraints if constraint.guided]
         return {number: len(self.boundary) + i for i, number in enumerate(guided)}
 
     @property
@@ -394,7 +364,7 @@ class Scene(eqx.Module):
         """The particles' stencil at time t, with the moving-least-squares gradient where the transfer needs it."""
         window, layer = self.window(particles), None
         if self.bodies is not None:  # each body has a layer of nodes of its own
-            layer = np.repeat(self.bodies.numbers(len(self.laws)), particles.sizes).astype(np.int32)
+            layer = np.repeat(self.layers, particles.sizes).astype(np.int32)
         x = self.on_grid(particles, t)
         stencil = make_stencil(self.kernel, self.gradient, self.grid, window, x, layer=layer)
         if self.kernel.order > 1:

@@ -3,19 +3,16 @@
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, NodeVector, Scalar
 from mpmjax.boundary import (
     Impulses,
-    OwnedCouple,
     OwnedImpulse,
     owners_of,
     received_impulses,
     taken_by_mirrors,
 )
 from mpmjax.discretisation import Gathered
-from mpmjax.geometry import moment
-from mpmjax.material import Freedom
-from mpmjax.potential import Image, RigidImage
+from mpmjax.potential import Image
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping._grid_update import GridUpdate, reaction
 from mpmjax.stepping._integrator import AbstractIntegrator
@@ -29,7 +26,7 @@ def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator,
     assert colliders is not None
     position, pivots = colliders.position, colliders.pivots
     if share is not None:
-        position = position + share * nodes.dt * nodes.mirror.unfold(new.motion.carrier)
+        position = position + share * nodes.dt * nodes.potential.mirror.unfold(new.motion.carrier)
         pivots = pivots + share * nodes.dt * colliders.pivot_velocity
     held, numbers = new.held(nodes), _boundaries_of_colliders(scene)
     holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
@@ -48,33 +45,30 @@ def impulse_on_boundaries(
     method: AbstractIntegrator,
     new: GridUpdate,
 ) -> Impulses:
-    """The impulse on each boundary of the scene, and on what guides its rigid bodies, in the step from t, from the
+    """The impulse on each boundary of the scene, and by each constraint that holds a body, in the step from t, from the
     nodes at its start, before and after the fold at symmetry planes, and their update."""
     held, force_at = new.held(nodes), method.force_at()
     solved, carrier = new.solved.velocity, new.motion.carrier
     whole, elastic = new.solved, new.elastic
-    if nodes.mirror.images:  # of all nodes
-        whole = jax.tree.map(nodes.mirror.unfold, whole)
+    if nodes.potential.mirror.images:  # of all nodes
+        whole = jax.tree.map(nodes.potential.mirror.unfold, whole)
         elastic = None if unfolded.f is None else method.elastic_impulse(unfolded, whole)
     residual = reaction(unfolded, whole, elastic)
     grid, window, dt = scene.grid, scene.window(particles), nodes.dt
     each = enumerate(scene.boundary)
     images = [(n, image) for n, boundary in each for image in boundary.mirror_images(grid, window, t, dt)]
     contacts = list(zip(nodes.brought_by, nodes.contacts, held.active, strict=True))
-    unfold = nodes.mirror.unfold
+    unfold = nodes.potential.mirror.unfold
     at = scene.nodes(particles, t)
     owners = owners_of(scene.boundary, at, grid.spacing, t, dt, reference=scene.total)
     planes = [(number, image) for number, image in images if isinstance(image, Image)]
     couples, soft = [], jnp.ones_like(unfolded.mass, dtype=bool)
-    for body, image in zip(scene.rigid_bodies, nodes.mirror.rigid, strict=True):
-        guide = scene.guides.get(body.number)
-        owners, of_spin = _spread(owners, image, unfolded.mass, planes, body.freedom, guide)
-        # the change of its angular momentum Iω less that of its nodes, which have an inertia and a spin of their own
-        changed = image.own(solved - nodes.velocity)[1]
-        of_nodes = image.own(unfolded.mass[:, None] * (unfold(solved) - unfolded.velocity))
-        couple = image.angular(image.own(nodes.mass)[1] * changed) - moment(image.arms, of_nodes).sum(axis=0)
-        couples.append(OwnedCouple(couple, of_spin))
-        soft = image.with_own(soft, jnp.zeros(len(image.arms), dtype=bool))
+    for constraint, image in zip(scene.constraints, nodes.tied, strict=True):
+        loose, tied = (unfolded.mass, unfold(solved) - unfolded.velocity), (nodes.mass, solved - nodes.velocity)
+        guide = scene.guides.get(constraint.number)
+        owners, couple = constraint.received(image, owners, planes, loose, tied, guide)
+        couples.append(couple)
+        soft = image.with_own(soft, jnp.zeros_like(image.own(soft)))
 
     # springs act on all nodes
     parts = []
@@ -91,7 +85,7 @@ def impulse_on_boundaries(
         zero, slope = jnp.zeros((grid.dim, 1), residual.dtype), jnp.zeros((grid.dim, grid.dim, 1), residual.dtype)
         none, whole_change = Gathered(zero, slope, slope), Gathered(zero + 1, slope, slope)
         kept = (scene.transfer.velocity(zero, none, whole_change) - scene.transfer.velocity(zero, none, none)).T
-        mass = jnp.where(soft, unfolded.mass, 0) if couples else unfolded.mass  # a rigid body takes the velocity
+        mass = jnp.where(soft, unfolded.mass, 0) if couples else unfolded.mass  # a constraint takes the velocity
         residual = residual + kept * mass[:, None] * (unfolded.velocity - unfold(new.before(nodes)))
     of_planes, residual = taken_by_mirrors(residual, images)
     parts += of_planes
@@ -132,8 +126,8 @@ def impulse_on_boundaries(
         places = places if colliders is None else jnp.where(colliders.touched[:, None], colliders.position, places)
     if force_at is not None:
         carried = unfold(carrier)
-        for image in nodes.mirror.rigid:  # to where its centre goes; its couple is about that
-            carried = image.with_own(carried, jnp.broadcast_to(image.own(carrier)[0], image.arms.shape))
+        for image in nodes.tied:
+            carried = image.with_own(carried, image.places(carrier))
         places = places + force_at * dt * carried
         pivots = pivots + force_at * (_pivots(scene, t + dt, residual) - pivots)
     return received_impulses(parts, places, pivots, couples)
@@ -142,35 +136,6 @@ def impulse_on_boundaries(
 def _boundaries_of_colliders(scene: Scene) -> list[int]:
     """The number of the boundary that each collider is."""
     return [n for n, boundary in enumerate(scene.boundary) for _ in range(boundary.collider_count)]
-
-
-def _spread(
-    owners: Int[Array, "n d"],
-    image: RigidImage,
-    mass: NodeScalar,
-    planes: list[tuple[int, Image]],
-    freedom: Freedom,
-    guide: int | None,
-) -> tuple[Int[Array, "n d"], Int[Array, ""]]:
-    """The owners where what holds a node of a rigid body holds all of them in this direction, and who holds its spin.
-
-    The body's own guides hold what they forbid, else the first one holds. Directions in which nothing is held add up to
-    no force; their moment is that of who holds the spin, or of the guides, about the body's centre then none. The
-    masses are those of all nodes [kg], shape (n,); planes come with their boundaries' numbers, as the guides' number.
-    """
-    layer, full = image.own(owners), image.own(mass) > 0
-    nobody = jnp.iinfo(layer.dtype).max
-    first = jnp.where((layer >= 0) & full[:, None], layer, nobody).min(axis=0)
-    for number, plane in planes:
-        first = jnp.where(image.reaches(plane, mass), jnp.minimum(first, number), first)
-    of_spin = first.min()
-    if guide is not None:
-        of_spin = jnp.where(freedom.turns & (of_spin < nobody), of_spin, guide)
-    first = jnp.where(first == nobody, of_spin, first)
-    if guide is not None and freedom.directions is not None:
-        first = jnp.where(jnp.asarray(freedom.directions), first, guide)
-    first, of_spin = (jnp.where(number == nobody, -1, number) for number in (first, of_spin))
-    return image.with_own(owners, jnp.broadcast_to(first, layer.shape)), of_spin
 
 
 def _pivots(scene: Scene, t: Scalar, like: NodeVector) -> Array:

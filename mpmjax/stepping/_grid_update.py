@@ -6,13 +6,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import NodeVector, Scalar
+from mpmjax._types import Array, Int, NodeVector, Scalar
 from mpmjax.autodiff import saved_for_backward, without_derivative
-from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, count_places, find_active_set
+from mpmjax.boundary import ActiveSet, ConstrainedNodes, ContactInfo, constrain, count_places
 from mpmjax.implicit import SolveInfo
+from mpmjax.potential import Mirror
 from mpmjax.stepping._implicit_integrators import AbstractImplicitIntegrator
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
+
+SWEEPS = 4
+"""Most active sets that are tried in a step."""
 
 
 class GridUpdate(eqx.Module):
@@ -74,37 +78,53 @@ class StageFriction(eqx.Module):
 def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     """The grid update with contact: the active set is searched without derivatives, the last solve with it held is
     differentiated, and friction acts after that."""
-
-    def solve(
-        held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
-    ) -> tuple[ConstrainedNodes, NodeMotion, NodeMotion, SolveInfo]:
-        motion, info = method.advance(replace(held.nodes, friction=StageFriction(held)), guess)
-        motion = solved = jax.tree.map(held.images.unfold, motion)
-        if motion.friction is not None:
-            solved = replace(motion, velocity=motion.velocity - motion.friction)
-        return replace(held, displacement=method.mean_displacement(held.nodes, motion)), motion, solved, info
-
-    frozen, frozen_method, guess = without_derivative((nodes, method, method.initial_guess(nodes)))
-
-    def attempt(held: ConstrainedNodes, guess: NodeVector) -> tuple:
-        held, motion, solved, info = solve(held, frozen_method, guess)
-        elastic = None if frozen.f is None else frozen_method.elastic_impulse(frozen, motion)
-        missing = reaction(frozen, solved, elastic)
-        return held, motion.velocity, held.without_spring_impulses(missing), motion.carrier, info
-
-    start = frozen_method.mean_displacement(frozen, NodeMotion(guess))
-    zero = jnp.zeros((), guess.dtype)
-    none = SolveInfo(residual=zero, report=zero)
-    active, guess, cost, sweeps = saved_for_backward(
-        find_active_set(frozen, guess, start, attempt, none, explicit=method.is_explicit)
-    )
-    held, motion, solved, info = solve(constrain(nodes, active), method, guess)
+    active, guess, cost, sweeps = saved_for_backward(find_active_set(*without_derivative((nodes, method))))
+    held, motion, solved, info = _solve_held(constrain(nodes, active), method, guess)
     elastic = None if nodes.f is None else method.elastic_impulse(nodes, motion)
     holding = held.without_spring_impulses(reaction(nodes, solved, elastic))
     velocity, friction = held.friction(solved.velocity, holding)
     contact = ContactInfo(sweeps, count_places(nodes, *held.violations(solved.velocity, holding)))
     motion = method.with_friction(motion, velocity - motion.velocity)
     return GridUpdate(motion, solved, elastic, cost.followed_by(info), held, friction, contact)
+
+
+def find_active_set(
+    nodes: Nodes, method: AbstractIntegrator
+) -> tuple[ActiveSet, NodeVector, SolveInfo, Int[Array, ""]]:
+    """The active set of contact, a velocity to start the last solve from, the report of the solves for it, and their
+    number. No contact may hold anything of the nodes yet. Not to be differentiated: loops have no derivative."""
+
+    def sweep(state: tuple) -> tuple:
+        active, guess, cost, _, count = state
+        held, motion, solved, info = _solve_held(constrain(nodes, active), method, guess)
+        elastic = None if nodes.f is None else method.elastic_impulse(nodes, motion)
+        residual = held.without_spring_impulses(reaction(nodes, solved, elastic))
+        pulls, enters = held.violations(motion.velocity, residual)
+        active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
+        return active, motion.carrier, cost.followed_by(info), count_places(nodes, pulls, enters) > 0, count + 1
+
+    guess, zero, none = method.initial_guess(nodes), jnp.zeros((), nodes.mass.dtype), jnp.asarray(0, jnp.int32)
+    start = method.mean_displacement(nodes, NodeMotion(guess))
+    predictor, nothing_held = nodes.explicit_velocity(), ConstrainedNodes(nodes, (), Mirror(()), nodes, start)
+    active = tuple(contact.likely_held(nothing_held, predictor) for contact in nodes.contacts)
+    cost = SolveInfo(residual=zero, report=zero)
+    # the force of an explicit step is known at its start, and with it which gaps are shut
+    if method.is_explicit and all(contact.known_at_start(nodes) for contact in nodes.contacts):
+        return active, guess, cost, none
+    first = (active, guess, cost, jnp.asarray(True), none)
+    active, guess, cost, _, count = jax.lax.while_loop(lambda s: s[3] & (s[4] < SWEEPS), sweep, first)
+    return active, guess, cost, count
+
+
+def _solve_held(
+    held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
+) -> tuple[ConstrainedNodes, NodeMotion, NodeMotion, SolveInfo]:
+    """The nodes with their displacement, their motion, that before friction, and the report of the solve."""
+    motion, info = method.advance(replace(held.nodes, friction=StageFriction(held)), guess)
+    motion = solved = jax.tree.map(held.images.unfold, motion)
+    if motion.friction is not None:
+        solved = replace(motion, velocity=motion.velocity - motion.friction)
+    return replace(held, displacement=method.mean_displacement(held.nodes, motion)), motion, solved, info
 
 
 def reaction(nodes: Nodes, motion: NodeMotion, elastic: NodeVector | None) -> NodeVector:

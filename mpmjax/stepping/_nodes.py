@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
-from typing import Any
+from typing import Any, NoReturn
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,9 +21,8 @@ from mpmjax.boundary import (
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.potential import AbstractTerm, Forces, Mirror
-from mpmjax.state import Particles, Scene, load_force, points_of, terms_of
+from mpmjax.state import AbstractLayerImage, Particles, Scene, load_force, points_of, terms_of
 from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
-from mpmjax.stepping._rigid_layers import rigid_layers
 
 
 class Nodes(AbstractNodes):
@@ -50,7 +49,9 @@ class Nodes(AbstractNodes):
     brought_by: tuple[int | None, ...] = eqx.field(static=True, default=())
     """The number of the boundary that brings each contact; None for that of two bodies."""
     loose: "Nodes | None" = None
-    """The nodes with those of rigid bodies each by itself; None without rigid bodies."""
+    """The nodes before the constraints of bodies; None without any."""
+    tied: tuple[AbstractLayerImage, ...] = ()
+    """The maps of these constraints."""
     friction: Callable[..., NodeVector] | None = None
     """The friction of contacts in an inner stage (see `StageFriction`); None without contacts."""
 
@@ -66,35 +67,28 @@ class Nodes(AbstractNodes):
         Raises:
             ValueError: P2G summed momentum and force together. So for `force` and `acceleration`.
         """
-        return self._apart(self.v)
+        return self.v if self.f is not None else self._refuse()
 
     @property
     def force(self) -> NodeVector:
         """Internal force at the start of the step [N], shape (n, d), with that of explicit viscosity."""
-        return self._apart(self.f)
+        return self.f if self.f is not None else self._refuse()
 
     @property
     def acceleration(self) -> Array:
         """Body acceleration g [m/s²], shape (d,) or (n, d)."""
-        return self._apart(self.g)
+        return self.g if self.f is not None else self._refuse()
 
-    def _apart(self, field: Any) -> Any:
-        if self.f is None:
-            raise ValueError(
-                "P2G summed momentum and forces in one, so v^n, g and the force are not known apart: only "
-                "nodes.explicit_velocity() is. An integrator that uses them must have needs_separate_force = True."
-            )
-        return field
+    def _refuse(self) -> NoReturn:
+        raise ValueError(
+            "P2G summed momentum and forces in one, so v^n, g and the force are not known apart: only "
+            "nodes.explicit_velocity() is. An integrator that uses them must have needs_separate_force = True."
+        )
 
     @property
     def free(self) -> Mask:
         """Whether a component is not prescribed, and its node has mass, shape (n, d)."""
         return self.occupied & ~self.conditions.fixed
-
-    @property
-    def mirror(self) -> Mirror:
-        """The mirror images of symmetry planes, and of the active columns of contact planes."""
-        return self.potential.mirror
 
     @property
     def free_normals(self) -> tuple[FreeNormal, ...]:
@@ -198,7 +192,7 @@ def particles_to_grid(
     """
     size, v = scene.grid.size, components(particles.v)
     C = None if particles.C is None else components(particles.C)
-    joined = joined and (stencil.is_least_squares or not scene.transfer.affine) and not scene.rigid_bodies
+    joined = joined and (stencil.is_least_squares or not scene.transfer.affine)
     potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), size)
     flux = potential.weighted_stress()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
     if explicit_viscosity and C is not None and potential.material_viscous:
@@ -267,13 +261,18 @@ def with_boundaries(
 
 
 def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar) -> Nodes:
-    """The nodes, folded at the scene's symmetry planes, and those of rigid bodies to the two that move each."""
+    """The nodes, folded at the scene's symmetry planes, and those of constrained bodies to the few that move each."""
     images = mirror(scene.boundary, scene.grid, scene.window(particles), t, nodes.dt)
-    if scene.rigid_bodies:
-        rigid, of_bodies, v, conditions = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
-        loose = nodes.folded(images) if images.images else nodes
-        nodes = loose.folded(rigid)
-        return replace(nodes, v=jnp.where(of_bodies, v, nodes.velocity), conditions=conditions, loose=loose)
+    bodies = [constraint.at_start(scene, particles, nodes, images) for constraint in scene.constraints]
+    if bodies:
+        loose, tied = nodes.folded(images) if images.images else nodes, tuple(image for image, *_ in bodies)
+        nodes = loose.folded(Mirror(tied))
+        layers = nodes.velocity, nodes.conditions.fixed, nodes.conditions.velocity
+        for image, *parts in bodies:
+            layers = [image.with_own(field, layer) for field, layer in zip(layers, parts, strict=True)]
+        v, fixed, prescribed = layers
+        conditions = Conditions(fixed, prescribed, nodes.conditions.colliders)
+        return replace(nodes, v=v, conditions=conditions, loose=loose, tied=tied)
     if not images.images:
         return nodes
     if not images.moving:
@@ -299,7 +298,7 @@ def start_nodes(
     nodes = particles_to_grid(
         scene, particles, t, dt, stencil, body_force_at=body_force_at, explicit_viscosity=explicit_viscosity
     )
-    if scene.boundary or scene.bodies is not None or scene.rigid_bodies:
+    if scene.boundary or scene.bodies is not None or scene.constraints:
         nodes = folded_at_planes(scene, particles, with_boundaries(scene, particles, nodes, t, force_at), t)
     return nodes
 

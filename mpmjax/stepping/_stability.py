@@ -184,7 +184,7 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator, t: Sc
         terms = tuple(spring for spring in springs if spring is not None)
         pushed = nodes.constrained(Mirror(()), nodes.mass, nodes.conditions.fixed, terms)
         a = pushed.projection.combine(pushed.per_mass(pushed.force) + pushed.acceleration, 0.0)
-        slopes = gather(stencil, nodes.mirror.unfold(a))[1]
+        slopes = gather(stencil, nodes.potential.mirror.unfold(a))[1]
         rates, fastest = la.symmetric_eigen((slopes + la.transpose(slopes)) / 2)[0], []
         for law, points in zip(scene.laws, materials, strict=True):
             r = points.rows_of(rates)

@@ -21,7 +21,6 @@ from mpmjax.stepping._boundary_forces import impulse_on_boundaries, impulse_on_c
 from mpmjax.stepping._grid_update import GridUpdate, constrained_update
 from mpmjax.stepping._integrator import AbstractIntegrator, Explicit, NodeMotion
 from mpmjax.stepping._nodes import Nodes, folded_at_planes, particles_to_grid, with_boundaries
-from mpmjax.stepping._rigid_layers import moved_rigidly
 
 
 class StepInfo(eqx.Module):
@@ -72,9 +71,9 @@ def step_unchecked(
             stencil,
             body_force_at=method.body_force_at,
             explicit_viscosity=method.explicit_viscosity,
-            joined=not (method.needs_separate_force or scene.transfer.needs_change),
+            joined=not (method.needs_separate_force or scene.transfer.needs_change or scene.constraints),
         )
-    if scene.boundary or scene.bodies is not None or scene.rigid_bodies:
+    if scene.boundary or scene.bodies is not None or scene.constraints:
         with jax.named_scope("boundaries"):
             unfolded = with_boundaries(scene, particles, nodes, t, force_at)
             nodes = folded_at_planes(scene, particles, unfolded, t)
@@ -153,10 +152,10 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
         histories=particles.histories,
     )
     moved = with_state(particles, after)
-    if not scene.rigid_bodies:
-        return moved
-    end, mean = new.motion.velocity, new.motion.carrier
-    return moved_rigidly(scene, particles, moved, nodes.mirror, nodes.conditions.fixed, end, mean, dt)
+    for constraint, image in zip(scene.constraints, nodes.tied, strict=True):
+        end, mean = new.motion.velocity, new.motion.carrier
+        moved = constraint.moved(particles, moved, image, nodes.conditions.fixed, end, mean, dt)
+    return moved
 
 
 def force_error(
@@ -189,7 +188,7 @@ def force_error(
         stays = np.repeat([not law.relaxes_stress for law in scene.laws], trial.sizes)
         if stays.any():
             sums = scatter(nodes.potential.stencil, jnp.where(stays, trial.mass, 0)[None], None, nodes.potential.size)
-            mass = mass + nodes.mirror.fold_scalar(sums[:, 0])
+            mass = mass + nodes.potential.mirror.fold_scalar(sums[:, 0])
     momentum = mass[:, None] * motion.velocity
     norms = [jnp.linalg.norm(a) for a in (exact, elastic, nodes.dt * nodes.force, momentum)]
     return jnp.linalg.norm(exact - elastic) / nodes.dt, reduce(jnp.maximum, norms) / nodes.dt
