@@ -6,18 +6,21 @@
 
 Checks come first: states and gradients by the initial velocity after some steps of a small block, of all laws and
 integrators, transfers, kernels and dimensions, in both precisions, against the same on the CPU by XLA. What differs by
-more than a tolerance is named at the end, and the exit status is 1. Then times, by the default back end and by XLA
+more than a tolerance is named at the end, and the exit status is 1. Then times, by the device's own back end and by XLA
 alone in turns: explicit steps of the blocks of `throughput.py`, an iteration of the solve, the gradient of a hundred
 steps, and a batch of 1024 members. Medians; memory is that of the compiled program.
 """
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import equinox as eqx
@@ -68,7 +71,7 @@ def cases() -> Iterator[tuple[str, int, Any, dict[str, Any], Any, float]]:
 
 
 def outcome(d: int, law: Any, choices: dict, method: Any, factor: float, dtype: str) -> Callable[[], tuple]:
-    """State and gradient of a small block after some steps, as a function that is compiled when it is called."""
+    """State and gradient of a small block after some steps."""
     b = block(d, 216 if d == 3 else 36, 16, 2**d, dtype)
     scene = mpm.Scene(mpm.Grid((b.nodes,) * d, b.spacing), law, gravity=(*[0.0] * (d - 1), -9.81), **choices)
 
@@ -95,26 +98,40 @@ def apart(ours: tuple, theirs: tuple) -> float:
     )
 
 
+def outcomes(quick: bool) -> dict[str, tuple]:
+    """State and gradient of each case in both precisions, compiled by several threads."""
+    of = {
+        f"{name}, {dtype}": outcome(*case, dtype)
+        for name, *case in cases()
+        if not quick or name == "2-D"
+        for dtype in TOLERANCES
+    }
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as threads:
+        return dict(zip(of, threads.map(lambda run: run(), of.values()), strict=True))
+
+
 def checks(quick: bool) -> Iterator[Row]:
-    """Each case in both precisions against the CPU."""
-    cpu = jax.local_devices(backend="cpu")[0]
-    for name, *case in cases():
-        if quick and name != "2-D":
-            continue
-        for dtype, tolerance in TOLERANCES.items():
-            run = outcome(*case, dtype)
-            ours = run()
-            jax.clear_caches()
-            with summed_by("xla"), jax.default_device(cpu):
-                difference = apart(ours, run())
-            jax.clear_caches()
-            yield {"what": f"{name}, {dtype}", "apart": difference, "right": difference <= tolerance}
+    """Each case against the CPU by XLA, which a process of its own computes meanwhile."""
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "MPMJAX_BACKEND": "xla"}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "reference.npz"
+        command = [sys.executable, __file__, "--reference", str(path), *(["--quick"] if quick else [])]
+        with subprocess.Popen(command, env=environment) as other, summed_by(kinds()[0]):
+            ours = outcomes(quick)
+        if other.returncode:
+            raise SystemExit("The reference on the CPU failed.")
+        with np.load(path) as reference:
+            for what, arrays in ours.items():
+                theirs = tuple(reference[f"{what} {k}"] for k in range(len(arrays)))
+                difference = apart(arrays, theirs)
+                right = difference <= TOLERANCES[what.rpartition(", ")[2]]
+                yield {"what": what, "apart": difference, "right": right}
 
 
-def kinds() -> dict[str, str | None]:
-    """The back ends that take turns: the default one, and XLA if that is another."""
-    name = mpm.native.backend().name
-    return {name: None} | ({} if name == "xla" else {"xla": "xla"})
+def kinds() -> list[str]:
+    """The back ends that take turns: this device's own, where it can be used, and XLA."""
+    platform = "cpu" if jax.default_backend() == "cpu" else "cuda"
+    return [*(kind.name for kind in mpm.native.BACKENDS if kind.platform == platform and not kind.absence()), "xla"]
 
 
 def taken(what: str, codes: dict[str, Callable[[], Any]], repeats: int, share: float = 1, **more: Any) -> Row:
@@ -130,13 +147,13 @@ def steps(quick: bool) -> Iterator[Row]:
     for name, numbers in scenes.items():
         for dtype in ("float32",) if quick or name in LARGE else ("float32", "float64"):
             b, count = block(*numbers, dtype), 2 if quick else 50
-            ours = {kind: Ours(b, mpm.UpdatedLagrangian(), count, backend=to) for kind, to in kinds().items()}
+            ours = {kind: Ours(b, mpm.UpdatedLagrangian(), count, backend=kind) for kind in kinds()}
             codes = {kind: go.further for kind, go in ours.items()}
             megabytes = {f"{kind} [MB]": go.memory / 1e6 for kind, go in ours.items()}
             yield taken(f"step {name}, {dtype}", codes, 2 if quick else 7, count, **megabytes)
     name, numbers = next(iter(scenes.items()))
     few, more = ITERATIONS
-    cut = {kind: iterations(block(*numbers, "float32"), to) for kind, to in kinds().items()}
+    cut = {kind: iterations(block(*numbers, "float32"), kind) for kind in kinds()}
     each = [{kind: both[k].further for kind, both in cut.items()} for k in (0, 1)]
     rows = [taken("", codes, 2 if quick else 7) for codes in each]
     per = {key: (rows[1][key] - rows[0][key]) / (more - few) for key in rows[0] if key != "what"}
@@ -147,7 +164,7 @@ def programs(quick: bool) -> Iterator[Row]:
     """A gradient beside its run, and a batch."""
     b = block(2, 400 if quick else 10_000, 128, 4, "float32")
     count, members, small = (3, 4, 100) if quick else (100, 1024, 2500)
-    for what, of, batch in (("one run", b, None), ("batch", block(2, small, 64, 4, "float32"), members)):
+    for what, of, batch in (("one run", b, None), (f"{members} runs", block(2, small, 64, 4, "float32"), members)):
         scene = mpm.Scene(mpm.Grid((of.nodes,) * 2, of.spacing), mpm.NeoHookean(E_MODULUS, NU))
         x, v, one = jnp.asarray(of.x, "float32"), jnp.asarray(of.v, "float32"), jnp.ones(len(of.x), "float32")
         start = mpm.prepare(scene, mpm.Particles(x, v, of.mass * one, of.volume * one))
@@ -160,9 +177,9 @@ def programs(quick: bool) -> Iterator[Row]:
         given = v if batch is None else v * jnp.linspace(0.5, 1, batch, dtype="float32")[:, None, None]
         for name, function in (("run", height), ("value and gradient", jax.value_and_grad(height))):
             codes = {}
-            for kind, to in kinds().items():
+            for kind in kinds():
                 mapped = jax.jit((lambda f: lambda v: f(v))(function if batch is None else jax.vmap(function)))
-                with summed_by(to):
+                with summed_by(kind):
                     program = mapped.lower(given).compile()
                 codes[kind] = lambda program=program, given=given: jax.block_until_ready(program(given))
                 jax.clear_caches()
@@ -178,7 +195,7 @@ def environment() -> Row:
     except (OSError, subprocess.CalledProcessError):
         card = "no nvidia-smi"
     versions = {"jax": jax.__version__, "python": sys.version.split()[0], "mpmjax": mpm.__version__}
-    return versions | {"device": device.device_kind, "card": card, "sums": str(mpm.native.backend())}
+    return versions | {"device": device.device_kind, "card": card, "sums": kinds()[0]}
 
 
 def shown(row: Row) -> str:
@@ -192,7 +209,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small scenes")
     parser.add_argument("--only", choices=("checks", "steps", "programs"), help="one part alone")
     parser.add_argument("--json", type=Path, help="a file for the rows")
+    parser.add_argument("--reference", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.reference:
+        found = outcomes(options.quick).items()
+        np.savez(options.reference, **{f"{what} {k}": a for what, arrays in found for k, a in enumerate(arrays)})
+        return
     begun, told = time.perf_counter(), environment()
     print(", ".join(f"{key} {value}" for key, value in told.items()), flush=True)
     rows = []

@@ -2,8 +2,10 @@
 
 import ctypes
 import hashlib
+import json
 import shutil
 import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -25,6 +27,7 @@ from test_native import (
 )
 
 import mpmjax as mpm
+from mpmjax.cli._commands import installation
 from mpmjax.discretisation import Stencil
 from mpmjax.native import AbstractBackend, _backend, _library
 
@@ -163,17 +166,18 @@ def test_nvrtc_compiles_the_kernels(card, types, tmp_path):
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="there may be a card")
 def test_without_a_card_one_line_says_why_and_xla_sums(choose, monkeypatch, capfd):
-    """`mpmjax info` too; nothing else is said, and asked for it is an error."""
+    """`mpmjax info` too; nothing else is said, and to ask for it is an error."""
     monkeypatch.delenv("MPMJAX_BACKEND", raising=False)
     reason = _backend.Cuda.absence()
     assert reason
     assert "\n" not in reason
-    assert str(mpm.native.backend("cuda")) == f"XLA (no cuda library: {reason})"
+    assert str(mpm.native.backend("cuda")) == "XLA (cuda is on trial, taken with MPMJAX_BACKEND=cuda)"
     assert mpm.native.backend("rocm").name == "xla"
     choose("cuda")
-    with pytest.raises(ValueError, match="there is no library of them that can be used"):
+    with pytest.raises(ValueError, match="asks for the cuda sums, but there is no library of them that can be used"):
         mpm.native.backend("cuda")
     assert mpm.native.backend("cpu").name == "xla"
+    assert f"cuda       {reason}" in installation()
     assert capfd.readouterr() == ("", "")
 
 
@@ -188,3 +192,15 @@ def test_nvrtc_is_found_in_wheels(monkeypatch, tmp_path):
     found = list(_library._nvrtc())
     assert [path for path in found if str(tmp_path) in path] == [str(places[0]), str(places[1])]
     assert found[-1] == "libnvrtc.so.12"
+
+
+@pytest.mark.thorough
+def test_the_script_for_a_card_runs(tmp_path):
+    """On this device with tiny scenes: each row of its table is there, and finite."""
+    rows = tmp_path / "rows.json"
+    script = NATIVE.parent / "benchmarks" / "gpu.py"
+    subprocess.run([sys.executable, str(script), "--quick", "--json", str(rows)], check=True)
+    told = json.loads(rows.read_text())["rows"]
+    assert [row["right"] for row in told if "right" in row] == [True, True]
+    assert len(told) == 8
+    assert all(np.isfinite(value) for row in told for key, value in row.items() if key != "what")

@@ -26,6 +26,8 @@ class AbstractBackend(eqx.Module):
     """The platform of JAX, such as cpu."""
     gains_from_order: ClassVar[bool] = False
     """Whether sorting particles by cell saves more time in its sums than it takes."""
+    by_default: ClassVar[bool] = True
+    """Whether it is taken without being asked for."""
 
     @staticmethod
     def absence() -> str:
@@ -103,6 +105,7 @@ class Cuda(AbstractBackend):
 
     name = "cuda"
     platform = "cuda"
+    by_default = False  # until it has run on a card
 
     @staticmethod
     def absence() -> str:
@@ -133,8 +136,8 @@ def backend(platform: str | None = None) -> AbstractBackend:
     """Who sums between particles and nodes in what is compiled next, and why: `native`, compiled kernels for CPUs,
     `cuda`, kernels for NVIDIA's cards, or `xla`.
 
-    The environment variable MPMJAX_BACKEND, one of these, chooses when a program is compiled; without it CPUs and cards
-    take their kernels where these were built and can be loaded. They differ by rounding.
+    The environment variable MPMJAX_BACKEND, one of these, chooses when a program is compiled; without it CPUs take
+    theirs where these were built, and other devices XLA's. They differ by rounding.
 
     Args:
         platform: the platform of JAX, such as cpu or cuda. Default: that of the default device.
@@ -153,6 +156,8 @@ def backend(platform: str | None = None) -> AbstractBackend:
     for kind in BACKENDS:
         if kind.platform != platform or asked not in ("", kind.name):
             continue
+        if not asked and not kind.by_default:
+            return XLA(f"{kind.name} is on trial, taken with {VARIABLE}={kind.name}")
         absence = kind.absence()
         if absence and asked:
             raise ValueError(
