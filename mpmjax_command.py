@@ -317,14 +317,19 @@ def render(
 @_reporting
 def info(
     path: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="An HDF5 file of a run, to describe.")] = None,
+    table: Annotated[
+        Path | None, typer.Option(help="A CSV file to write: energies, reactions and solver statistics of each frame.")
+    ] = None,
     imports: Imports = None,
 ) -> None:
     """Describe a run's file, or the installation.
 
     Without a file it says which versions run, on which devices, and who sums between particles and nodes."""
     _require(path is None or path.exists(), f"{path} does not exist: check its name.")
+    _require(path is not None or table is None, "--table is of a run: name its file.")
+    _require_folder(table)
     with _package(imports) as cli:
-        print(cli.installation() if path is None else cli.describe_run(path))
+        print(cli.installation() if path is None else cli.describe_run(path, table))
 
 
 @app.command()

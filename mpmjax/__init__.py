@@ -62,7 +62,7 @@ from mpmjax.geometry import (
     RigidMotion as RigidMotion,
     TimeSeries as TimeSeries,
 )
-from mpmjax.io import load as load, record as record, register as register, save as save
+from mpmjax.io import load as load, record as record, register as register, save as save, table as table
 from mpmjax.material import (
     AbstractMaterial as AbstractMaterial,
     CamClay as CamClay,

@@ -76,6 +76,7 @@ FUNCTIONS = {
     mpm.geometry.sample_mesh: {"mesh": "nowhere.stl", "spacing": 0.02},
     mpm.save: {"path": "never.h5", "run": None},
     mpm.load: {"path": "never.h5"},
+    mpm.table: {"run": "never.h5"},
     mpm.load_scene: {"path": "never.toml"},
     mpm.render: {"run": None, "path": "never.png"},
     mpm.analysis.work_precision: {"build": reached, "t1": 0.1},

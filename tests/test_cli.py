@@ -195,7 +195,10 @@ def test_check_says_what_a_scene_takes_and_what_looks_wrong(folder, tmp_path):
 
 
 def test_info_describes_a_file(folder):
-    code, out, err = shell("info", folder / "run.h5")
+    code, out, err = shell("info", folder / "run.h5", "--table", folder / "run.csv")
+    written = np.genfromtxt(folder / "run.csv", delimiter=",", names=True, deletechars="")
+    np.testing.assert_allclose(written["time_[s]"], [0, 0.02, 0.04, 0.06])
+    assert written["iterations"][-1] > written["iterations"][0] == 0
     assert code == 0, err
     assert re.search(
         r"frames +4, from t = 0 s to 0\.06 s\nmaterials +FixedCorotated\nparticles +36\nsteps +6 of 0\.01 s", out

@@ -279,6 +279,37 @@ def test_fields_are_those_that_were_asked_for(tmp_path):
     assert_same(load(other), run)
 
 
+@pytest.mark.parametrize("frame", [0, 2, -1])
+def test_one_frame_is_read_without_the_rest(frame, tmp_path):
+    """Of the others a file may have lost the data."""
+    run, path = made_up(2), tmp_path / "run.h5"
+    save(path, run)
+    with h5py.File(path, "r+") as file:
+        points = file["VTKHDF/Points"]
+        points[7 * (frame % 3) - 7 : 7 * (frame % 3) or 21] = 0  # of another
+    one = load(path, frame=frame)
+    assert_same((one.frame(0), one.steps), (run.frame(frame), run.steps[np.asarray([frame])]))
+    assert_same(one.final, run.frame(frame))
+    with pytest.raises(ValueError, match="not what was written"):
+        load(path)
+    with pytest.raises(ValueError, match="has 3 frames, there is no frame 3"):
+        load(path, frame=3)
+
+
+def test_a_run_is_a_table(tmp_path):
+    """Energies, forces and statistics of each frame, by name and unit; from a file the statistics too."""
+    scene, particles = jelly(boundary_forces=True)
+    record(tmp_path / "run.h5", scene, particles, t1=0.02, dt=5e-3, save_every=2, method=STEPPERS["semi_implicit"][0])
+    run, table = load(tmp_path / "run.h5"), mpm.table(tmp_path / "run.h5")
+    np.testing.assert_array_equal(table["time [s]"], run.times)
+    np.testing.assert_array_equal(table["boundary 0 force x [N]"][1:], run.boundary_forces().force[:, 0, 0])
+    energies = [float(mpm.energy(scene, run.frame(i)).elastic) for i in range(3)]
+    np.testing.assert_allclose(table["elastic energy [J]"], energies, rtol=1e-12)
+    assert table["iterations"][0] == 0
+    assert table["iterations"][-1] == run.statistics.iterations > 0
+    assert set(table) - set(mpm.table(run)) == {f.name for f in dataclasses.fields(RunStatistics)}
+
+
 def test_the_file_says_what_it_holds(tmp_path):
     """Units, dtype, dimension and the scene can be read without this package."""
     run = made_up(2)

@@ -26,7 +26,7 @@ from mpmjax.fitting import (
     predict_observations,
     profile,
 )
-from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, reporting, steps_in, stopping
+from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, replacing, reporting, steps_in, stopping, table
 from mpmjax.native import BACKENDS, backend
 from mpmjax.simulation import Problem, Run, initial_state, no_steps, run_to
 from mpmjax.state import Particles
@@ -294,15 +294,22 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
         say("written", str(plot))
 
 
-def describe_run(path: Path) -> str:
-    """A run's file in words."""
+def describe_run(path: Path, csv: Path | None = None) -> str:
+    """A run's file in words; its table as CSV, if a place for that is given."""
     run = load(path)
     lines = {
         "file": f"{path}, {_bytes(path.stat().st_size)}, {run.final.x.dtype}",
         "frames": f"{len(run)}, from t = {float(run.times[0]):.6g} s to {float(run.times[-1]):.6g} s",
         "materials": ", ".join(run.scene.titles),
     }
-    return "\n".join([*(f"{name:<18} {text}" for name, text in lines.items()), _summary(run.frame(0), run)])
+    described = [*(f"{name:<18} {text}" for name, text in lines.items()), _summary(run.frame(0), run)]
+    if csv is not None:
+        columns = table(path)
+        with replacing(csv) as aside:
+            head = ",".join(columns)
+            np.savetxt(aside, np.stack(list(columns.values()), axis=1), "%.17g", ",", header=head, comments="")
+        described.append(f"{'written':<18} {csv}")
+    return "\n".join(described)
 
 
 def installation() -> str:

@@ -28,6 +28,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mpmjax._types import Scalar
+from mpmjax.analysis import energy
 from mpmjax.checks import canonical, checked, is_traced, require, require_memory, require_whole, requirements, warn
 from mpmjax.io._frame_writer import FIELDS_WRITTEN, FrameWriter, at, check_fields, frames_in, new_writer
 from mpmjax.io._run_file import (
@@ -197,13 +198,18 @@ def save(path: str | os.PathLike, run: Run, *, fields: tuple[str, ...] | list[st
 
 
 @checked
-def load(path: str | os.PathLike) -> Run:
+def load(path: str | os.PathLike, *, frame: int | None = None) -> Run:
     """The run in a file, bit for bit: scene, method, dt, frames, statistics; `final` is the last frame.
     Unless jax's 64-bit mode is on, a float64 run is rounded to float32, with a warning.
 
+    Args:
+        path: the file.
+        frame: number of the only frame to read, which the run then ends with; counts from the end if negative.
+            Default: all.
+
     Raises:
-        ValueError: a file that is missing, cut short or damaged, not of this package or of another format, without
-            frames.
+        ValueError: a frame that is not there; a file that is missing, cut short or damaged, not of this package or of
+            another format, without frames.
     """
     path = Path(path)
     with reading(path) as file:
@@ -214,7 +220,13 @@ def load(path: str | os.PathLike) -> Run:
             warn(f'{path} holds a {dtype} run, read in {most}: call jax.config.update("jax_enable_x64", True) before.')
             dtype = most
         require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
-        require_memory(f"The run in {path}", path.stat().st_size, "read a part of it by h5py.")
+        count, which = count_in(file), frame
+        require_of_file(
+            which is None or -count <= which < count, f"{path} has {count} frames, there is no frame {which}."
+        )
+        start, stop = (0, count) if which is None else (which % count, which % count + 1)
+        size = path.stat().st_size * (stop - start) / count
+        require_memory(f"The run in {path}", size, "read one of its frames by load(path, frame=0).")
         scene = decode(described["scene"], Scene, "scene", arrays)
         method = decode(described["method"], AbstractIntegrator, "method", arrays)
         scene, method = canonical((scene, method), dtype)
@@ -222,7 +234,7 @@ def load(path: str | os.PathLike) -> Run:
         blank = jax.device_put(np.zeros((len(parts["mass"]), scene.grid.dim), dtype))
         particles = Particles(blank, blank, **parts, counts=described["counts"])
         like = jax.eval_shape(lambda: initial_state(scene, prepare(scene, particles)))
-        steps, frames, tallies = frames_in(file, like, 0, count_in(file))
+        steps, frames, tallies = frames_in(file, like, start, stop)
         check_numbers(scene, described["dt"], steps, frames.particles)
     last, statistics = at((frames, tallies), -1)
     return run_to(
@@ -235,3 +247,36 @@ def load(path: str | os.PathLike) -> Run:
         collider_impulse=frames.collider_impulse,
         boundary_impulse=frames.boundary_impulse,
     )
+
+
+@checked
+def table(run: Run | str | os.PathLike) -> dict[str, np.ndarray]:
+    """Numbers of each saved frame of a run or of one in a file, by their names and units: step, time, energies, the
+    mean force and torque on each collider and boundary since the frame before (see `Run.forces`; NaN at the first).
+    From a file also the `RunStatistics` up to the frame. `pandas.DataFrame` takes them; `mpmjax info RUN --table`
+    writes them as CSV.
+
+    Raises:
+        ValueError: a run without frames, and those of `load`.
+    """
+    statistics: dict[str, np.ndarray] = {}
+    if not isinstance(run, Run):
+        path, run = Path(run), load(run)
+        with reading(path) as file:
+            rows = file["mpmjax/frames"][: len(run)]
+            statistics = {name: rows[name] for name in rows.dtype.names if name != "step"}
+    require(len(run) > 0, "The run has no frames to tabulate: pass save_every to simulate.")
+    columns = {"step": np.asarray(run.steps), "time [s]": np.asarray(run.times)}
+    energies = [energy(run.scene, run.frame(i)) for i in range(len(run))]
+    for name in ("kinetic", "elastic", "potential", "total"):
+        columns[f"{name} energy [J]"] = np.array([float(getattr(e, name)) for e in energies])
+    for what, impulse, forces in (
+        ("collider", run.collider_impulse, run.forces),
+        ("boundary", run.boundary_impulse, run.boundary_forces),
+    ):
+        for kind, unit in (("force", "N"), ("torque", "N m")) if impulse is not None else ():
+            mean = np.asarray(getattr(forces(), kind))
+            axes = "xyz" if kind == "force" or mean.shape[2] == 3 else "z"
+            for k, axis in np.ndindex(mean.shape[1:]):
+                columns[f"{what} {k} {kind} {axes[axis]} [{unit}]"] = np.append(np.nan, mean[:, k, axis])
+    return columns | statistics
