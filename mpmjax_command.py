@@ -6,6 +6,7 @@ Ctrl-C ends the command as quietly as SIGTERM does, not with a traceback of what
 
 import importlib
 import importlib.util
+import os
 import re
 import signal
 import sys
@@ -92,6 +93,10 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
                 warnings.simplefilter("default", UserWarning)
                 warnings.showwarning = lambda message, *_: tell(f"warning: {' '.join(str(message).split())}")
                 command(*args, **kwargs)
+                sys.stdout.flush()
+        except BrokenPipeError:  # who reads, such as `head`, has enough; what is left must not fail at the exit again
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(1) from None
         except typer.Exit:  # a RuntimeError too
             raise
         except (ValueError, RuntimeError, OSError, MemoryError, ImportError) as error:

@@ -207,6 +207,17 @@ def test_info_describes_a_file(folder):
     assert "jaxlib" in shell("info")[1]
 
 
+def test_a_reader_who_has_enough_ends_a_command_quietly():
+    """Such as `mpmjax example | head -1`, whose pipe breaks when it is written or flushed."""
+    command = [sys.executable, "-m", "mpmjax_command", "example"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 1
+
+
 def test_an_example_is_copied_with_its_data(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert shell("example")[1].count("\n") == len([*EXAMPLES.glob("*.toml"), *EXAMPLES.glob("*.py")])

@@ -2,12 +2,15 @@
 
 import functools
 import json
+from dataclasses import replace
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib import pyplot as plt
 from scipy.integrate import quad
 from scipy.optimize import least_squares, lsq_linear
 from scipy.stats import norm, t
@@ -117,6 +120,37 @@ def test_the_band_of_a_linear_problem_is_students(fall):
     later = mpm.fitting.predict(result, twice_as_long)
     assert later.value == pytest.approx(0.15 + last @ found, abs=1e-5)
     assert later.error == pytest.approx(np.sqrt(last @ covariance @ last), rel=1e-3)
+
+
+def test_a_fit_draws_itself(fall):
+    """Into axes of its own or others, a colour for each component that was measured, by its name."""
+    _, result = fall
+    (axis,) = result.plot()
+    (band,) = mpm.fitting.predict_observations(result)
+    (model,) = (line for line in axis.lines if line.get_label() == "fit")
+    assert np.allclose(model.get_ydata(), band.value[:, 0])
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("time [s]", "series")
+    assert axis.get_legend_handles_labels()[1] == ["95 % of the mean", "fit", "measured"]
+    assert result.plot(axis) == (axis,)
+    with pytest.raises(ValueError, match="got 2 axes and 1 predictions for 1"):
+        result.plot([axis, axis])
+    plt.close()
+
+
+def test_what_a_fit_says_follows_from_its_residuals(fall):
+    """With large ones drawn nearer too: the same by the runs of other experiments."""
+    _, result = fall
+    (e,) = result.problem.experiments
+    (o,) = e.observations
+    drawn = eqx.tree_at(lambda o: (o.weight, o.robust), o, (0.5, 0.7), is_leaf=lambda a: a is None)
+    (value,), (J,) = result.fitted
+    r, column = jax.jvp(
+        lambda p: drawn.residuals(p, result.sigmas[0]), (jnp.asarray(value),), (jnp.asarray(J[..., 0]),)
+    )
+    parts = {"residuals": np.asarray(r), "jacobian": np.asarray(column)[:, None]}
+    moved = replace(result, experiments=(e.with_observations((drawn,), e.t1),), **parts)
+    assert np.allclose(moved.fitted[0][0], value)
+    assert np.allclose(moved.fitted[1][0], J[..., :1])
 
 
 @pytest.mark.thorough

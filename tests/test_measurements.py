@@ -7,10 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib import pyplot as plt
 
 import mpmjax as mpm
 from mpmjax.cli._fit_file import read_fit
 from mpmjax.cli._scene_file import read_simulation
+from mpmjax.fitting import Prediction
+from mpmjax.fitting._picture import draw_observation
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.state import with_state
 
@@ -102,6 +105,22 @@ def test_each_kind_predicts_what_was_measured_of_the_same_run(pushed):
         size = np.abs(seen.data[measured]).max()
         assert size > 0, kind
         assert np.allclose(np.asarray(predicted)[measured], seen.data[measured], rtol=0, atol=1e-9 * size), kind
+
+
+def test_a_picture_shows_the_columns_of_the_file(pushed):
+    """The curve of force against displacement, in its units and signs, and no component that was not measured."""
+    observations = dict(zip(KINDS, read_fit(pushed / "block.toml").experiments[0].observations, strict=True))
+    rows = np.genfromtxt(pushed / "curve.csv", delimiter=",", skip_header=1)
+    axes = plt.subplots(2, 1)[1]
+    for axis, kind in zip(axes, ("ForceDisplacement", "Force"), strict=True):
+        data = observations[kind].data
+        flat = Prediction(data, data, data, data, None, None, None, 0.95)
+        draw_observation(axis, observations[kind], flat, np.inf)
+        assert axis.get_legend_handles_labels()[1] == ["95 % of the mean", "fit", "measured"]
+    (dots,) = (line for line in axes[0].lines if line.get_label() == "measured")
+    np.testing.assert_allclose(np.sort(dots.get_xydata(), axis=0), np.sort(rows, axis=0), atol=1e-12)
+    assert [(axis.get_xlabel(), axis.get_ylabel()) for axis in axes] == [("u [mm]", "load [N]"), ("t [s]", "fy [N]")]
+    plt.close()
 
 
 def test_velocity_and_spin_are_those_of_the_body(pushed):

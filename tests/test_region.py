@@ -275,7 +275,7 @@ def test_a_mesh_is_sampled():
         mpm.geometry.sample_mesh((corners, faces[:-1]), 0.05)
 
 
-@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+@pytest.mark.parametrize("suffix", ["stl", *thorough("obj", "ply")])
 def test_a_scene_file_names_a_mesh_with_its_scale_and_place(suffix, tmp_path):
     """The file lies beside that of the scene, and may be in millimetres, of which units that are wrong remind."""
     import trimesh

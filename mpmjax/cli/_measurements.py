@@ -24,11 +24,13 @@ from mpmjax.fitting import (
     Force,
     Markers,
     Series,
+    Shown,
     StressStretch,
     Torque,
     Tracks,
     after,
     read_arrays,
+    stated_unit,
 )
 from mpmjax.geometry import AbstractRegion
 from mpmjax.io import arguments
@@ -138,12 +140,43 @@ def observation(
     keys.__signature__ = inspect.Signature([*special, *shared])  # pyright: ignore[reportFunctionMemberAccess]
     values = arguments(keys, {k: v for k, v in table.items() if k != "kind"}, f"{_HEADER} {kind}")
     chosen: dict[str, Any] = {"time": ""} | {p.name: values.pop(p.name) for p in shared if p.name in values}
-    made = make(Measurement(simulation=simulation, folder=folder, **chosen), **values)
+    measurement = Measurement(simulation=simulation, folder=folder, **chosen)
+    made = make(measurement, **values)
     if isinstance(made, tuple):
-        return made
+        return _shown(made[0], measurement, values), _shown(made[1], measurement, values)
+    made = _shown(made, measurement, values)
     part = made.part_until(t1)
     require(part is not None, f"{made.title} begins at {made.times[0]:g} s, after t1 = {t1:g} s.")
     return part, made
+
+
+_SI = {"place": "m", "force": "N", "torque": "N m", "nominal_stress": "Pa"}
+"""Units of the columns that keys name, where they are always the same."""
+
+
+def _shown(made: Any, m: Measurement, keys: dict[str, Any]) -> Any:
+    """An observation that pictures show as its file has it."""
+    key = next((key for key in (*_SI, "value") if key in keys), None)
+    if key is None or "grid" in keys:  # a picture
+        return made
+    heads = (keys[key],) if isinstance(keys[key], str) else keys[key]
+    si = _SI.get(key, "m" if isinstance(made.of, Extent) else "J")
+
+    def named(head: str, factor: float, of: str) -> str:
+        unit = of if factor == 1 else f"{factor:g} {of}"
+        return head if stated_unit(head) is not None else f"{head} [{unit}]"
+
+    measured = [head for head in heads if head]
+    y = named(measured[0] if len(measured) == 1 else made.name.split(" [")[0], float(m.unit), si)
+    path, x_unit = None, float(m.time_unit)
+    if "displacement" in keys:
+        x = named(keys["displacement"], float(m.length_unit), "m")
+        rows = Columns(m.folder / m.data, keys["displacement"])[keys["displacement"]]
+        path = tuple(made.times.tolist()), tuple(rows.tolist())
+    else:
+        x = keys["stretch"] if "stretch" in keys else named(m.time, x_unit, "s")
+    columns = tuple(heads) if made.data.shape[1:] == (len(heads),) else ()
+    return eqx.tree_at(lambda o: o.shown, made, Shown(x, y, columns, x_unit, float(m.unit) * float(m.scale), path))
 
 
 def _kind(name: str, without: tuple[str, ...] = ("length_unit",)) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -10,8 +10,18 @@ from mpmjax.fitting._columns import (
     after as after,
     read_arrays as read_arrays,
     read_columns as read_columns,
+    stated_unit as stated_unit,
 )
-from mpmjax.fitting._experiment import AbstractObservation as AbstractObservation, Experiment as Experiment
+from mpmjax.fitting._estimate import (
+    AbstractFit as AbstractFit,
+    Estimate as Estimate,
+    NoiseEstimate as NoiseEstimate,
+)
+from mpmjax.fitting._experiment import (
+    AbstractObservation as AbstractObservation,
+    Experiment as Experiment,
+    Shown as Shown,
+)
 from mpmjax.fitting._field import Field as Field
 from mpmjax.fitting._fit import EnsembleFit as EnsembleFit, fit as fit, fit_ensemble as fit_ensemble
 from mpmjax.fitting._observation import (
@@ -31,9 +41,9 @@ from mpmjax.fitting._parameter import (
     Smooth as Smooth,
     Unbounded as Unbounded,
 )
+from mpmjax.fitting._picture import measured_components as measured_components
 from mpmjax.fitting._prediction import (
     Bootstrap as Bootstrap,
-    Prediction as Prediction,
     bootstrap as bootstrap,
     predict as predict,
     predict_observations as predict_observations,
@@ -47,12 +57,7 @@ from mpmjax.fitting._quantities import (
     Markers as Markers,
     StressStretch as StressStretch,
 )
-from mpmjax.fitting._result import (
-    AbstractFit as AbstractFit,
-    Estimate as Estimate,
-    FitResult as FitResult,
-    NoiseEstimate as NoiseEstimate,
-)
+from mpmjax.fitting._result import FitResult as FitResult
 from mpmjax.fitting._search import AbstractOptimiser as AbstractOptimiser, Evaluation as Evaluation
 from mpmjax.fitting._sequence import (
     RefinedFit as RefinedFit,
@@ -60,3 +65,4 @@ from mpmjax.fitting._sequence import (
     fit_staged as fit_staged,
 )
 from mpmjax.fitting._starts import Screening as Screening, Starts as Starts
+from mpmjax.fitting._uncertainty import Prediction as Prediction

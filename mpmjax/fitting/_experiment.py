@@ -16,6 +16,30 @@ from mpmjax.stepping import AbstractIntegrator, Explicit
 Numbers = Float[np.ndarray, "..."] | Float[Array, "..."] | list | tuple | float | int
 
 
+class Shown(eqx.Module):
+    """How pictures show an observation: its columns in their file's units, if it has one.
+
+    Args:
+        x: the abscissa's name, with its unit. Default: that of the observation.
+        y: the ordinate's name, with its unit.
+        columns: names of the data's components, for the legend.
+        x_unit: what one of the abscissa's unit is [SI].
+        unit: what one of the data's unit is [SI]; negative where the file counts the other way.
+        path: times [s] and the abscissa at these, in its unit, of data that were not measured against time.
+    """
+
+    x: str = eqx.field(static=True, default="")
+    y: str = eqx.field(static=True, default="")
+    columns: tuple[str, ...] = eqx.field(static=True, default=())
+    x_unit: float = eqx.field(static=True, default=1.0)
+    unit: float = eqx.field(static=True, default=1.0)
+    path: tuple[tuple[float, ...], tuple[float, ...]] | None = eqx.field(static=True, default=None)
+
+    def along(self, x: np.ndarray) -> np.ndarray:
+        """The abscissae of pictures, from those of the observation."""
+        return np.asarray(x) / self.x_unit if self.path is None else np.interp(x, *self.path)
+
+
 class AbstractObservation(eqx.Module):
     """A measurement of an experiment.
 

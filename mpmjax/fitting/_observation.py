@@ -10,7 +10,7 @@ import numpy as np
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import as_floats, require, require_fields, require_finite
 from mpmjax.fitting._columns import ROUNDED, after
-from mpmjax.fitting._experiment import AbstractObservation, Numbers
+from mpmjax.fitting._experiment import AbstractObservation, Numbers, Shown
 from mpmjax.fitting._quantities import Markers
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene
@@ -22,6 +22,7 @@ class _Measured(AbstractObservation):
     sigma: Float[np.ndarray, "..."] | None = eqx.field(converter=as_floats, default=None, kw_only=True)
     weight: Scalar = eqx.field(converter=as_floats, default=1.0, kw_only=True)
     robust: Scalar | None = eqx.field(converter=as_floats, default=None, kw_only=True)
+    shown: Shown = eqx.field(default=Shown(), kw_only=True)
 
 
 class Curve(_Measured):
@@ -34,6 +35,7 @@ class Curve(_Measured):
         sigma: standard deviation of the noise of y; None to estimate it.
         weight, robust, name: see `Series`.
         x_name: what pictures call the abscissa.
+        shown: how pictures show it, such as in other units.
     """
 
     x: Float[np.ndarray, "m"] = eqx.field(converter=as_floats)
@@ -98,6 +100,7 @@ class Series(_Measured):
         weight: factor of the squares.
         robust: misfit in standard deviations beyond which squares grow but linearly.
         name: what tables and pictures call it.
+        shown: how pictures show it, such as in other units.
     """
 
     times: Float[np.ndarray, "f"] = eqx.field(converter=as_floats)

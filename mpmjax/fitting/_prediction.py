@@ -11,26 +11,13 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
+from mpmjax.fitting._estimate import AbstractFit, Estimate
 from mpmjax.fitting._experiment import Experiment, Numbers
 from mpmjax.fitting._fit import checked_level
 from mpmjax.fitting._problem import Coordinates, FitProblem, linearised, table
-from mpmjax.fitting._result import AbstractFit, Estimate, FitResult
+from mpmjax.fitting._result import FitResult
 from mpmjax.fitting._search import AbstractOptimiser, batch_size, counted, search_many
-from mpmjax.fitting._uncertainty import quantile
-
-
-class Prediction(eqx.Module):
-    """A quantity by a fit, with the error that the parameters' errors make. All arrays have its shape."""
-
-    value: np.ndarray
-    error: np.ndarray  # standard error; infinite where the value depends on what the data do not see
-    lower: np.ndarray
-    """Where the value lies at the level: the confidence band. It holds at each point, not at all of them together."""
-    upper: np.ndarray
-    sigma: np.ndarray | None  # standard deviation of the noise of a measurement of it, where that is known
-    new_lower: np.ndarray | None  # where a new measurement lies at the level, its noise included: the prediction band
-    new_upper: np.ndarray | None
-    level: float  # the level of the bands [-], such as 0.95
+from mpmjax.fitting._uncertainty import Prediction, banded
 
 
 @checked
@@ -91,7 +78,8 @@ def predict(
             noise = np.broadcast_to(np.asarray(sigma, float), value.shape)
         except ValueError:
             raise ValueError(fault) from None
-    return _prediction(result, value, J, noise, None, level)
+    level = checked_level(result.level if level is None else level)
+    return banded(result.uncertainty, level, value, J, noise)
 
 
 @checked
@@ -121,16 +109,12 @@ def predict_observations(
         f"predict_observations needs experiments with as many observations as were fitted, {wanted}, got {shape}.",
     )
     problem, observations = result.problem, [o for e in asked for o in e.observations]
+    level = checked_level(result.level if level is None else level)
     same = all(
         e.t1 == f.t1 and eqx.tree_equal(e.observations, f.observations) for e, f in zip(asked, fitted, strict=True)
     )
-    if same and all(o.robust is None and np.isfinite(o.data).all() for o in observations):
-        # The fit has them, and their derivatives, in its residuals.
-        values, derivatives = [], []
-        for o, sigma, rows in zip(observations, result.sigmas, problem.rows, strict=True):
-            scale = np.broadcast_to(np.asarray(sigma, float) / np.sqrt(o.trust[0]), o.data.shape)
-            values.append(o.data + scale * result.residuals[rows].reshape(o.data.shape))
-            derivatives.append(scale[..., None] * result.jacobian[rows].reshape(*o.data.shape, -1))
+    if same and all(np.isfinite(o.data).all() for o in observations):
+        values, derivatives = result.fitted
     else:
         asked = tuple(e.with_observations(a.observations, a.t1) for e, a in zip(fitted, asked, strict=True))
         z = jnp.asarray(result.z, problem.dtype)
@@ -144,7 +128,7 @@ def predict_observations(
             noise = np.broadcast_to(sigma, np.shape(value))
         except ValueError:
             noise = np.full(np.shape(value), np.sqrt((sigma**2).mean()))
-        predictions.append(_prediction(result, value, J, noise, number, level))
+        predictions.append(banded(result.uncertainty, level, value, J, noise, number))
     return tuple(predictions)
 
 
@@ -173,39 +157,6 @@ def _linearised(
     """Values and their derivatives by the coordinates, shape (..., n), compiled."""
     values, columns = linearised(partial(function, problem), z, problem.at_once)
     return values, tuple(jnp.moveaxis(column, 0, -1) for column in columns)
-
-
-def _prediction(
-    result: FitResult,
-    value: Array | np.ndarray,
-    J: Array | np.ndarray,
-    sigma: np.ndarray | None,
-    number: int | None,
-    level: Scalar | None,
-) -> Prediction:
-    """Values with their bands, by their derivative J, shape (..., n). `sigma` is the noise of new measurements, if that
-    is known, `number` that of their observation, if they are of one."""
-    level = checked_level(result.level if level is None else level)
-    mean, gradient, errors = np.asarray(value, float), np.asarray(J, float), result.uncertainty
-    has_derivative = np.asarray(np.isfinite(gradient).all(axis=-1))
-    gradient = np.where(has_derivative[..., None], gradient, 0)
-    lost = int((np.isfinite(mean) & ~has_derivative).sum())
-    if lost:
-        warn(f"{lost} of {mean.size} predicted numbers have no derivative, and so no band.")
-    error, freedom = errors.of(gradient)
-    error = np.where(has_derivative, error, np.nan)
-    reach = quantile(level, freedom) * error
-    new_lower = new_upper = None
-    if sigma is not None:
-        # One observation: s² + g·C g, Student's as that of a mean. With several the noise adds to its own part alone.
-        total = np.where(np.isfinite(error), error, 0) ** 2 + sigma**2
-        brought = [part + (sigma**2 if k == number else 0) for k, part in enumerate(errors.brought(gradient))]
-        wider = np.where(np.isfinite(error), np.sqrt(total), error)
-        beyond = quantile(level, errors.freedom(total, brought)) * wider
-        new_lower, new_upper = np.asarray(mean - beyond), np.asarray(mean + beyond)
-    return Prediction(
-        mean, np.asarray(error), np.asarray(mean - reach), np.asarray(mean + reach), sigma, new_lower, new_upper, level
-    )
 
 
 class Bootstrap(AbstractFit):

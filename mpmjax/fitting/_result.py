@@ -1,82 +1,34 @@
 """Results of fits: estimates with their errors, and the table that shows them."""
 
-import abc
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array
 from mpmjax.checks import require
+from mpmjax.fitting._estimate import AbstractFit, Estimate, NoiseEstimate
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._misfit import IMPROBABLE, Shape, improbable, shape_of
 from mpmjax.fitting._parameter import AbstractParameter
+from mpmjax.fitting._picture import draw_observation
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas, table
 from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
 from mpmjax.fitting._starts import Screening
-from mpmjax.fitting._uncertainty import Uncertainty, at_bound, noise, quantile, seen_together, uncertainty
-
-
-class Estimate(NamedTuple):
-    """A fitted number, or one that follows from those."""
-
-    label: str
-    value: float
-    error: float  # standard error, of the noise and of what the misfit shows (see `fit`)
-    interval: tuple[float, float]  # where it lies at the level of the fit
-    unit: str = ""
-    start: float = np.nan  # the first guess
-    at_bound: bool = False  # whether it came to lie at a bound, where errors mean little
-    noise_error: float = np.nan  # standard error that the noise alone makes
-    noise_interval: tuple[float, float] = (np.nan, np.nan)
-
-    @property
-    def name(self) -> str:
-        """Label and unit."""
-        return f"{self.label} [{self.unit}]" if self.unit else self.label
-
-    @property
-    def cells(self) -> tuple[str, str]:
-        """Value with error, and interval, as a `table` has them."""
-        return f"{self.value:>12.6g} ± {self.error:<9.2g}", f"{self.interval[0]:.5g} to {self.interval[1]:.5g}"
-
-
-class NoiseEstimate(NamedTuple):
-    """The noise of an observation."""
-
-    name: str
-    sigma: float  # standard deviation, the root mean square where it varies, in the data's unit
-    estimated: bool  # whether the fit estimated it
-    misfit: float  # root mean square of the residuals, in units of σ
-    points: int  # how many numbers were measured
-    worth: float  # how many independent numbers they are worth, by the correlation of their residuals
-    shape: str  # the shape of the residuals, "a ramp", "drifts" or "correlated"; empty where they have none
-    is_beyond: bool  # whether the misfit is beyond the noise: by χ² where that is given, by the shape where it is not
-
-
-class AbstractFit(eqx.Module):
-    """Estimates by name: `result["E"]` is that of a parameter, and `print(result)` shows a table."""
-
-    @property
-    @abc.abstractmethod
-    def all(self) -> tuple[Estimate, ...]:
-        """The fitted numbers, and the reported ones."""
-
-    def __getitem__(self, label: str) -> Estimate:
-        """The estimate of a parameter, or of a reported number.
-
-        Raises:
-            KeyError: there is none of this name.
-        """
-        for estimate in self.all:
-            if estimate.label == label:
-                return estimate
-        raise KeyError(f"There is no estimate {label!r}, but {', '.join(e.label for e in self.all)}.")
+from mpmjax.fitting._uncertainty import (
+    Prediction,
+    Uncertainty,
+    at_bound,
+    banded,
+    noise,
+    quantile,
+    seen_together,
+    uncertainty,
+)
 
 
 class FitResult(AbstractFit):
@@ -144,6 +96,57 @@ class FitResult(AbstractFit):
     def is_beyond(self) -> bool:
         """Whether the misfit of an observation is beyond its noise."""
         return any(noise.is_beyond for noise in self.noise)
+
+    @property
+    def fitted(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The fit's value of each observation where it was measured, NaN elsewhere, in the shape and unit of its
+        data, and its derivative by the coordinates, shape (..., n): both follow from the residuals."""
+        values, derivatives = [], []
+        observations = [o for e in self.experiments for o in e.observations]
+        for o, sigma, rows in zip(observations, self.sigmas, self.problem.rows, strict=True):
+            weight, limit = o.trust
+            r, J = self.residuals[rows] / np.sqrt(weight), self.jacobian[rows] / np.sqrt(weight)
+            if limit is not None:  # the inverse of `drawn_nearer`
+                s = (r / limit) ** 2 / 4
+                r, J = r * np.sqrt(1 + s), J * ((1 + 2 * s) / np.sqrt(1 + s))[:, None]
+            scale = np.broadcast_to(np.asarray(sigma, float), o.data.shape)
+            values.append(o.data + scale * r.reshape(o.data.shape))
+            derivatives.append(scale[..., None] * J.reshape(*o.data.shape, -1))
+        return values, derivatives
+
+    def plot(
+        self, axes: Any = None, *, measured: Sequence[Experiment] = (), predictions: Sequence[Prediction] = ()
+    ) -> tuple[Any, ...]:
+        """Draw what was measured, the fit, and the confidence band of its mean, in the data's units.
+
+        Args:
+            axes: matplotlib's axes to draw into, one for each observation. Default: those of a new figure.
+            measured: the experiments with more data than were fitted; `predictions` are then needed.
+            predictions: those of `predict_observations`, with bands of new measurements. Default: the fit's own.
+
+        Returns:
+            The axes: `result.plot()[0].figure.savefig("fit.pdf")`.
+
+        Raises:
+            ValueError: not as many axes, or predictions, as observations.
+        """
+        observations = [o for e in measured or self.experiments for o in e.observations]
+        fitted = [float(o.against[1].max()) for e in self.experiments for o in e.observations]
+        if not predictions:
+            each = zip(*self.fitted, strict=True)
+            predictions = [banded(self.uncertainty, self.level, value, J) for value, J in each]
+        if axes is None:
+            from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
+
+            count = len(observations)
+            axes = plt.subplots(count, 1, figsize=(5.4, 3.4 * count), layout="constrained", squeeze=False)[1]
+        axes = tuple(np.ravel(np.asarray(axes, dtype=object)))
+        counts = len(axes), len(predictions), len(observations)
+        fault = f"{counts[0]} axes and {counts[1]} predictions for {counts[2]}"
+        require(len(set(counts)) == 1, f"plot takes axes and a prediction for each observation, got {fault}.")
+        for axis, observation, predicted, last in zip(axes, observations, predictions, fitted, strict=True):
+            draw_observation(axis, observation, predicted, last)
+        return axes
 
     def restarted(self, parameters: Mapping[str, AbstractParameter]) -> dict[str, AbstractParameter]:
         """The parameters, to be searched from the fitted values."""

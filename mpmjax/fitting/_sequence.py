@@ -15,12 +15,13 @@ import numpy as np
 from mpmjax._types import Scalar
 from mpmjax.analysis import sensitivity
 from mpmjax.checks import checked, require, require_positive, warn
+from mpmjax.fitting._estimate import AbstractFit, Estimate, NoiseEstimate
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import chosen_optimiser, fit, require_derivative
 from mpmjax.fitting._observation import Series
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem, table
-from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, NoiseEstimate, restarted
+from mpmjax.fitting._result import FitResult, restarted
 from mpmjax.fitting._search import AbstractOptimiser, begin, iterate, jacobian, search
 from mpmjax.fitting._starts import Starts, as_starts
 from mpmjax.fitting._uncertainty import quantile

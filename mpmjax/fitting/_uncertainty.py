@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mpmjax.checks import warn
+
 _ROUNDINGS = 1e3
 """Singular values of J, its columns of length one, below this many roundings of the largest are none: the data do not
 see the direction."""
@@ -201,3 +203,49 @@ def seen_together(labels: tuple[str, ...], errors: Uncertainty, logarithmic: tup
                 texts.append(f"{proportion} is not seen by the data.")
     more = len(texts) - _MOST_SAID
     return texts[:_MOST_SAID] + ([f"There are {more} more such directions."] if more > 0 else [])
+
+
+class Prediction(NamedTuple):
+    """A quantity by a fit, with the error that the parameters' errors make. All arrays have its shape."""
+
+    value: np.ndarray
+    error: np.ndarray  # standard error; infinite where the value depends on what the data do not see
+    lower: np.ndarray
+    """Where the value lies at the level: the confidence band. It holds at each point, not at all of them together."""
+    upper: np.ndarray
+    sigma: np.ndarray | None  # standard deviation of the noise of a measurement of it, where that is known
+    new_lower: np.ndarray | None  # where a new measurement lies at the level, its noise included: the prediction band
+    new_upper: np.ndarray | None
+    level: float  # the level of the bands [-], such as 0.95
+
+
+def banded(
+    errors: Uncertainty,
+    level: float,
+    value: Any,
+    J: Any,
+    sigma: np.ndarray | None = None,
+    number: int | None = None,
+) -> Prediction:
+    """Values with their bands, by their derivative J, shape (..., n). `sigma` is the noise of new measurements, if that
+    is known, `number` that of their observation, if they are of one."""
+    mean, gradient = np.asarray(value, float), np.asarray(J, float)
+    has_derivative = np.asarray(np.isfinite(gradient).all(axis=-1))
+    gradient = np.where(has_derivative[..., None], gradient, 0)
+    lost = int((np.isfinite(mean) & ~has_derivative).sum())
+    if lost:
+        warn(f"{lost} of {mean.size} predicted numbers have no derivative, and so no band.")
+    error, freedom = errors.of(gradient)
+    error = np.where(has_derivative, error, np.nan)
+    reach = quantile(level, freedom) * error
+    new_lower = new_upper = None
+    if sigma is not None:
+        # One observation: s² + g·C g, Student's as that of a mean. With several the noise adds to its own part alone.
+        total = np.where(np.isfinite(error), error, 0) ** 2 + sigma**2
+        brought = [part + (sigma**2 if k == number else 0) for k, part in enumerate(errors.brought(gradient))]
+        wider = np.where(np.isfinite(error), np.sqrt(total), error)
+        beyond = quantile(level, errors.freedom(total, brought)) * wider
+        new_lower, new_upper = np.asarray(mean - beyond), np.asarray(mean + beyond)
+    return Prediction(
+        mean, np.asarray(error), np.asarray(mean - reach), np.asarray(mean + reach), sigma, new_lower, new_upper, level
+    )

@@ -13,11 +13,12 @@ from mpmjax.fitting import (
     Prediction,
     Profile,
     RefinedFit,
+    Shown,
+    measured_components,
     predict_observations,
 )
 from mpmjax.io import replacing, save_figure
 
-_MOST_LINES = 6  # components of an observation that are drawn
 _PROFILES_A_ROW = 3
 
 
@@ -41,9 +42,13 @@ def draw_fit(
     heights = [3.0] * len(observations) + [2.6] * (rows - len(observations))
     figure = plt.figure(figsize=(9.6, sum(heights)), layout="constrained")
     grid = figure.add_gridspec(rows, 6, height_ratios=heights)
+    result.plot(
+        [figure.add_subplot(grid[row, :4]) for row in range(len(observations))],
+        measured=shown,
+        predictions=predictions,
+    )
     for row, (observation, predicted, used) in enumerate(zip(observations, predictions, fitted, strict=True)):
-        left, right = figure.add_subplot(grid[row, :4]), figure.add_subplot(grid[row, 4:])
-        _draw_observation(left, right, observation, predicted, float(used.against[1].max()))
+        _draw_residuals(figure.add_subplot(grid[row, 4:]), observation, predicted, float(used.against[1].max()))
     row = len(observations)
     axis: Any = figure.add_subplot(grid[row, :2])
     last = max(i for i, iteration in enumerate(result.history) if iteration.number == 0)
@@ -73,48 +78,20 @@ def draw_fit(
     return path
 
 
-def _draw_observation(
-    left: Any, right: Any, observation: AbstractObservation, predicted: Prediction, last: float
-) -> None:
-    """Data, fit and bands on the left axes, residuals on the right ones; the fitted data end at `last`."""
-    name, x = observation.against
-    order = np.argsort(x)
-    x = x[order]
-
-    def columns(of: Any) -> np.ndarray:
-        return np.broadcast_to(np.asarray(of, float), predicted.value.shape).reshape(len(x), -1)[order]
-
-    data, model, lower, upper = (
-        columns(a) for a in (observation.data, predicted.value, predicted.lower, predicted.upper)
-    )
-    level = f"{100 * predicted.level:g} %"
-    for k in range(min(data.shape[1], _MOST_LINES)):
-        once = k == 0
-        if predicted.new_lower is not None:
-            new = columns(predicted.new_lower)[:, k], columns(predicted.new_upper)[:, k]
-            label = f"{level} of new measurements"
-            left.fill_between(x, *new, color=f"C{k}", alpha=0.12, linewidth=0, label=label if once else None)
-        label = f"{level} of the mean"
-        left.fill_between(
-            x, lower[:, k], upper[:, k], color=f"C{k}", alpha=0.35, linewidth=0, label=label if once else None
-        )
-        left.plot(x, model[:, k], color=f"C{k}", linewidth=1.2, label="fit" if once else None)
-        left.plot(
-            x, data[:, k], "o", color=f"C{k}", markersize=3.5, markeredgecolor="white", markeredgewidth=0.5,
-            label="measured" if once else None,
-        )  # fmt: skip
-    more = data.shape[1] - _MOST_LINES
-    left.legend(fontsize=7, frameon=False, title=f"{_MOST_LINES} of {data.shape[1]} shown" if more > 0 else None)
+def _draw_residuals(axis: Any, observation: AbstractObservation, predicted: Prediction, last: float) -> None:
+    """Residuals of the components that were measured, in units of the noise; those fitted end at `last`."""
+    shown: Shown = getattr(observation, "shown", Shown())
+    name, against = observation.against
+    x = shown.along(against)
     if predicted.sigma is not None:
-        right.axhspan(-2, 2, color="0.93", linewidth=0)
-        right.axhline(0, color="0.7", linewidth=0.8)
-        right.plot(x, (model - data) / columns(predicted.sigma), ".", color="0.3", markersize=4)
-    if x.max() > last:
-        for axis in (left, right):
-            axis.axvline(last, color="0.6", linewidth=0.8, linestyle="--")
-        left.set_title("fitted to the dashed line, predicted beyond", fontsize=9)
-    left.set(xlabel=name, ylabel=observation.name)
-    right.set(xlabel=name, ylabel="(fit − measured) / σ")
+        axis.axhspan(-2, 2, color="0.93", linewidth=0)
+        axis.axhline(0, color="0.7", linewidth=0.8)
+        r = ((predicted.value - observation.data) / predicted.sigma).reshape(len(x), -1)
+        for number, (k, _) in enumerate(measured_components(observation)):
+            axis.plot(x, r[:, k], ".", color=f"C{number}", markersize=4)
+    if against.max() > last:
+        axis.axvline(float(shown.along(np.array([last]))[0]), color="0.6", linewidth=0.8, linestyle="--")
+    axis.set(xlabel=shown.x or name, ylabel="(fit − measured) / σ")
 
 
 def _draw_profile(axis: Any, profile: Profile) -> None:
