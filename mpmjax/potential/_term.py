@@ -47,7 +47,7 @@ class Forces(NamedTuple):
     """a_p,b [J], shape (d, d, p), the derivative's direction b first; in bodies of revolution (3, 3, p)."""
 
     def in_section(self, radius: Float[Array, "p"]) -> "Forces":
-        """Those of matrices in space by what reaches the nodes of a body of revolution."""
+        """The forces with matrices in space taken to what a ring gives to the nodes of its section."""
         if self.slopes is None or len(self.slopes) == 2:
             return self
         around, slopes = in_section(radius, self.slopes)
