@@ -8,7 +8,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Matrix, NodeVector, ParticleScalar, Scalar, components
 from mpmjax.checks import canonical, checked, require, require_positive, require_whole
-from mpmjax.discretisation import Gathered, Stencil, gather, scatter
+from mpmjax.discretisation import Gathered, Stencil, gather, in_space, scatter
 from mpmjax.implicit import Projection
 from mpmjax.potential import Forces
 from mpmjax.state import Particles, Scene, prepare
@@ -292,6 +292,7 @@ def _budget(
             forces, dissipated = [force for force, _ in drags], sum((power for _, power in drags), dissipated)
             if potential.material_viscous and before.C is not None:
                 C = components(before.C)
+                C = C if stencil.radius is None else in_space(stencil.radius, components(before.v), C)
                 stress = potential.weighted_viscous_stress(C)
                 forces.append(Forces(slopes=-jnp.swapaxes(stress, 0, 1)))
                 dissipated = dissipated + (stress * C).sum()

@@ -10,7 +10,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Float, ParticleScalar, components
 from mpmjax.analysis._budget import energy_density
 from mpmjax.checks import canonical, checked
-from mpmjax.discretisation import gather, scatter
+from mpmjax.discretisation import gather, in_space, scatter
 from mpmjax.state import Particles, Scene, prepare, velocity_gradient
 
 
@@ -20,7 +20,8 @@ def stress(scene: Scene, particles: Particles) -> Float[Array, "p 3 3"]:
 
     σ = P Fᵀ/J + σ_v, of the elastic law for the present history, with the viscous stress where a law has one. Two
     dimensions are plane strain and one is uniaxial strain, in which there are stresses normal to the plane or the line
-    too. With averaged volumes it is the stress at F̄ (see `AveragedVolume`). It is differentiable by all floats.
+    too; of bodies of revolution the axes are r, z and around the axis. With averaged volumes it is the stress at F̄ (see
+    `AveragedVolume`). It is differentiable by all floats.
 
     *When it breaks*: of material that yielding has loosened or torn, J counts the volume without its gaps. Stresses
     oscillate from particle to particle, by about as much as they are; `analysis.smoothed` averages them.
@@ -96,10 +97,12 @@ def _stress_and_ratio(scene: Scene, particles: Particles) -> tuple[Float[Array, 
         sigma = elastic.measure.kirchhoff_stress(elastic.stress(F), F, 3) / J
         if points.viscosity is not None:
             C = particles.C if particles.C is not None else velocity_gradient(scene, particles)
-            L = points.rows_of(components(C))
+            L, v = points.rows_of(components(C)), points.rows_of(components(particles.v))
+            if scene.grid.axisymmetric:
+                L = in_space(points.rows_of(scene.anchor(particles)[:, 0]), v, L)
             if scene.total:
                 L = la.matmul(L, la.transpose(la.cofactor(points.deformation)) / la.determinant(points.deformation))
-            missing = (0, 3 - particles.dim)
+            missing = (0, 3 - len(L))
             sigma = sigma + points.viscosity.stress(jnp.pad(L, (missing, missing, (0, 0))))
         stresses.append(sigma)
         ratios.append(jnp.broadcast_to(J, points.volume.shape))

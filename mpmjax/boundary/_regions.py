@@ -126,7 +126,10 @@ class RigidPart(AbstractBoundary):
         return (Tie(self.holds(grid.nodes(window), grid.spacing)),)
 
     def check(self, grid: Grid, *, total: bool) -> None:
-        del grid
+        require(
+            not grid.axisymmetric or self.free in ((False, True), (False, False)),
+            f"A RigidPart of revolution cannot grow: give it free=(False, True), along the axis, got {self.free}.",
+        )
         require(
             total,
             "A RigidPart is of nodes that stay with the body: use the total description, or a stiff law for the part.",

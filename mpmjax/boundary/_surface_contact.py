@@ -122,9 +122,9 @@ class Springs(AbstractSpring):
 
     def elongation(self, moved: Displacement) -> Float[Array, "s p"]:
         """n · (u − ∇u b) [m], shape (s, p)."""
-        value, slopes = moved.at_particles
+        (value, slopes), d = moved.at_particles, len(self.normal)
         shift = (self.normal * value).sum(axis=0)
-        growth = (self.normal[None] * self.arm[:, None] * slopes).sum(axis=(0, 1))
+        growth = (self.normal[None] * self.arm[:, None] * slopes[:d, :d]).sum(axis=(0, 1))
         return jnp.stack([sign * shift - growth for sign in SIGNS[: len(self.stretch)]])
 
     def spread(self, amount: Float[Array, "s p"], size: int) -> Forces:

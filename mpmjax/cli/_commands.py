@@ -253,7 +253,7 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
         print(f"{name:<18} {text}", flush=True)
 
     say("materials", ", ".join(scene.titles))
-    each = float(particles.volume.mean()) / dx**particles.dim
+    each = float(scene.grid.section(x, particles.volume).mean()) / dx**particles.dim
     say("particles", f"{particles.count} of {particles.x.dtype}, {1 / each:.3g} a cell, {particles.mass.sum():.6g} kg")
     say("from, to", f"{x.min(axis=0)} m, {x.max(axis=0)} m")
     say("grid", f"{' x '.join(map(str, scene.grid.shape))} = {scene.grid.size} nodes, {dx:.4g} m apart")

@@ -1,5 +1,6 @@
 """Grid, B-spline kernels, stencils, and the transfers between particles and grid."""
 
+from mpmjax.discretisation._axisymmetry import in_section as in_section, in_space as in_space
 from mpmjax.discretisation._fused_sums import (
     average as average,
     resist as resist,

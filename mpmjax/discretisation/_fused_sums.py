@@ -16,6 +16,7 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.autodiff import custom_derivative, saved_for_backward
+from mpmjax.discretisation._axisymmetry import in_section, in_space
 from mpmjax.discretisation._native_sums import basis_attributes, call_average
 from mpmjax.discretisation._stencil import Basis, Stencil
 from mpmjax.discretisation._sums import (
@@ -99,9 +100,12 @@ def resist(stencil: Stencil, upper: Float[Array, "t p"], u: NodeVector) -> NodeV
     Args:
         stencil: stencil of the particles.
         upper: the upper triangle of each symmetric matrix K_p, row by row, shape (d²(d² + 1)/2, p). Its rows and
-            columns are the components of G_p, the direction b first.
+            columns are the components of G_p, the direction b first; of bodies of revolution those in space.
         u: what is gathered, shape (n, d).
     """
+    if stencil.radius is not None:
+        slopes = in_space(stencil.radius, *gather(stencil, u))
+        return scatter(stencil, *in_section(stencil.radius, _flux(upper, slopes)), len(u))
     if stencil.own_derivatives is not None:
         return scatter(stencil, None, _flux(upper, gather(stencil, u)[1]), len(u))
     upper, scaled = without_flat(stencil, upper), stencil.slope**2 * u

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -31,10 +32,14 @@ class Grid(eqx.Module):
         follow: whether the window moves by whole spacings to stay centred on the bounding box of the particles, with
             `origin` ignored. Results do not depend on the place of the window as long as it holds the particles.
         layers: how many nodes there are at each place. A scene sets it to the number of its `bodies`, whatever it was.
+        axisymmetric: whether the directions are r and z of bodies of revolution about r = 0, whose masses, forces and
+            energies are those of the whole circle; there is no torsion. The window must reach two spacings beyond an
+            axis that the material meets.
 
     Raises:
         ValueError: a shape that is not one to three integers of at least 4, a spacing that is not positive, an origin
-            or `periodic` of another length, or a window that both follows and is periodic.
+            or `periodic` of another length, a window that both follows and is periodic, or axisymmetry in other than
+            two dimensions or with a period along r.
     """
 
     shape: tuple[int, ...] = eqx.field(static=True, converter=tuple)
@@ -43,6 +48,7 @@ class Grid(eqx.Module):
     periodic: tuple[bool, ...] = eqx.field(static=True)
     follow: bool = eqx.field(static=True)
     layers: int = eqx.field(static=True)
+    axisymmetric: bool = eqx.field(static=True, default=False)
 
     @checked
     def __init__(
@@ -54,6 +60,7 @@ class Grid(eqx.Module):
         periodic: bool | tuple[bool, ...] | list[bool] = False,
         follow: bool = False,
         layers: int = 1,
+        axisymmetric: bool = False,
     ):
         self.shape = tuple(int(n) for n in shape)
         self.spacing = spacing
@@ -62,6 +69,7 @@ class Grid(eqx.Module):
         self.periodic = tuple(bool(p) for p in every)
         self.follow = follow
         self.layers = require_whole("layers", layers, 1)
+        self.axisymmetric = axisymmetric
 
     def __check_init__(self):
         d = len(self.shape)
@@ -85,11 +93,21 @@ class Grid(eqx.Module):
             not (self.follow and any(self.periodic)),
             "A periodic grid cannot follow the material: its window is its period. Drop follow=True or periodic.",
         )
+        require(
+            not self.axisymmetric or (d == 2 and not self.periodic[0]),
+            f"An axisymmetric grid must have two directions, r and z, and no period along r, got the shape {self.shape}"
+            f" and periodic = {self.periodic}.",
+        )
 
     @property
     def dim(self) -> int:
         """Space dimension d."""
         return len(self.shape)
+
+    @property
+    def strain_dim(self) -> int:
+        """Rows of a particle's deformation gradient: d, of bodies of revolution 3."""
+        return 3 if self.axisymmetric else len(self.shape)
 
     @property
     def size(self) -> int:
@@ -115,6 +133,10 @@ class Grid(eqx.Module):
         period = jnp.asarray(self.shape, x.dtype) * self.spacing
         turns = jnp.floor((x - window.astype(x.dtype) * self.spacing) / period)
         return jnp.where(jnp.asarray(self.periodic), x - turns * period, x)
+
+    def section(self, x: Any, volume: Any) -> Any:
+        """Volumes [m^d] of particles at x in the window's dimension: of bodies of revolution V/(2πr) [m²]."""
+        return volume / (2 * math.pi * x[:, 0]) if self.axisymmetric else volume
 
     def nodes(self, window: Int[Array, "d"]) -> NodeVector:
         """Positions of the window's nodes [m], shape (n, d)."""

@@ -112,11 +112,18 @@ class Stencil(eqx.Module):
     polynomials: all sums are then written in JAX. Else None."""
     flat: Bool[Array, "d p"] | None = None
     """Along which axes a particle has no gradient, shape (d, p). None: it has one along all."""
+    radius: Float[Array, "p"] | None = None
+    """Distance from the axis of bodies of revolution [m], shape (p,) (see `in_space`); else None."""
 
     @property
     def dim(self) -> int:
         """Space dimension d."""
         return len(self.basis.shape)
+
+    @property
+    def strain_dim(self) -> int:
+        """Rows of a particle's deformation gradient (see `Grid.strain_dim`)."""
+        return len(self.basis.shape) if self.radius is None else 3
 
     @property
     def is_least_squares(self) -> bool:
@@ -134,17 +141,19 @@ class Stencil(eqx.Module):
     @property
     def squared(self) -> "Stencil":
         """The stencil of w_ip² and of the squared components g_ip,a²."""
+        radius = None if self.radius is None else self.radius**2
         custom, families = self.own_derivatives, (self.basis.weights, self.basis.slopes)
         squares = [[np.polynomial.polynomial.polymul(row, row).tolist() for row in rows] for rows in families]
         weights, slopes = (tuple(map(tuple, rows)) for rows in squares)
         basis = self.basis._replace(weights=weights, slopes=slopes)
-        return replace(self, basis=basis, slope=self.slope**2, own_derivatives=None if custom is None else custom**2)
+        custom = None if custom is None else custom**2
+        return replace(self, basis=basis, slope=self.slope**2, own_derivatives=custom, radius=radius)
 
     def of(self, particles: Int[Array, "s"]) -> "Stencil":
         """The stencil of some of the particles, by their numbers."""
-        arrays = self.first, self.offset, self.inside, self.own_derivatives, self.flat
-        first, offset, inside, custom, flat = (a if a is None else a[..., particles] for a in arrays)
-        return replace(self, first=first, offset=offset, inside=inside, own_derivatives=custom, flat=flat)
+        names = "first", "offset", "inside", "own_derivatives", "flat", "radius"
+        arrays = {name: getattr(self, name) for name in names}
+        return replace(self, **{name: a if a is None else a[..., particles] for name, a in arrays.items()})
 
     def along(self, axis: int) -> "Stencil":
         """The stencil on the nodes of one axis, of whose layers all are one."""
@@ -233,7 +242,8 @@ def make_stencil(
     if gradient.polynomials(kernel) is None:
         families = basis.slopes, basis.moments
         custom = gradient.derivatives(*(basis._replace(slopes=c).polynomials((1, 0), offset) / dx for c in families))
-    return Stencil(first, offset, 1 / dx, in_window(kernel, grid, window, x), basis, custom)
+    radius = components(x)[0] if grid.axisymmetric else None
+    return Stencil(first, offset, 1 / dx, in_window(kernel, grid, window, x), basis, custom, radius=radius)
 
 
 def first_nodes(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d p"]:

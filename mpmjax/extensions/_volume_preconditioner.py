@@ -76,8 +76,8 @@ class VolumePreconditioner(AbstractPreconditioner):
         diagonal = DiagonalInnerProduct(projection.commuting_weight(operator.diagonal()))
         averaged = tuple(part for part in stiffness.coupled if isinstance(part, AveragedStiffness))
         planar = all(isinstance(image, Image) for image in stiffness.mirror.images)
-        if not averaged or any(averaged[0].average.periodic) or not planar:
-            return diagonal  # B then sees no box of nodes
+        if not averaged or any(averaged[0].average.periodic) or not planar or stiffness.stencil.radius is not None:
+            return diagonal  # B then sees no box of nodes, or a hoop that it does not know
         window = shape = averaged[0].average.shape
         if self.extent is not None:
             require(

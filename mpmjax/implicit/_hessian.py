@@ -81,7 +81,7 @@ class ParticleStiffness(AbstractHessianAction):
         Args:
             size: n.
         """
-        d = self.stencil.dim
+        d = self.stencil.strain_dim
         places = np.cumsum([0, *range(d * d, 1, -1)])  # of the diagonal, row by row
         elastic = jnp.stack([self.upper[m] for m in places]).reshape(d, d, -1)
         for part in self.coupled:
@@ -94,7 +94,7 @@ class ParticleStiffness(AbstractHessianAction):
     def damped(self, potential: ElasticPotential, rate: Scalar) -> "ParticleStiffness":
         """H + r D, with r = `rate` [1/s] and D [N s/m] the positive semi-definite matrix of the potential's viscous
         force."""
-        upper, d = self.upper, self.stencil.dim
+        upper, d = self.upper, self.stencil.strain_dim
 
         def damping(points: MaterialPoints) -> Array:
             def flux_of(slopes: Matrix) -> Matrix:
@@ -137,7 +137,7 @@ class TangentAction(AbstractHessianAction):
         return potential.on_nodes([elastic, *(term.hessian(at)(moved) for term in potential.terms)])
 
     def precomputed(self) -> ParticleStiffness:
-        potential, d = self.potential, self.potential.stencil.dim
+        potential, d = self.potential, self.potential.stencil.strain_dim
         pairs = zip(potential.material_points, self.tangents, strict=True)
         upper, coupled = zip(*(points.stiffness(tangent, d) for points, tangent in pairs), strict=True)
         at = potential.displaced(self.u)

@@ -101,6 +101,8 @@ class ImplicitOperator(eqx.Module):
         H = self.hessian
         if not isinstance(H, ParticleStiffness) or H.stencil.own_derivatives is not None:
             return False
+        if H.stencil.radius is not None:
+            return False
         return not (H.mirror.images or H.coupled or H.others or self.projection.normals or self.viscosity is not None)
 
     def precomputed(self) -> "ImplicitOperator":

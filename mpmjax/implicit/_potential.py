@@ -86,7 +86,7 @@ class ElasticPotential(eqx.Module):
     def weighted_stress(self, P: Sequence[Deformation] | None = None) -> Matrix:
         """V0_p P_p F_pᵀ [J], shape (d, d, p), of which the force is f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip; in the total
         description V0_p P_p. P is the stress of each material [Pa]. Default: at u = 0."""
-        d, each = self.stencil.dim, self.material_points
+        d, each = self.stencil.strain_dim, self.material_points
         P = [points.stress(points.deformation) for points in each] if P is None else P
         return jnp.concatenate([q.weighted_stress(stress, d) for q, stress in zip(each, P, strict=True)], axis=-1)
 

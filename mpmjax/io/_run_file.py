@@ -285,10 +285,11 @@ def rows_of(frame: int, time: float, state: State, fields: Mapping[str, Any]) ->
     p, d = x.shape
     flat = ((0, 0), (0, 3 - d))
     ratios, gradients = [], []
+    k = max((stored.shape[1] for _, stored, _ in by_material(state) if stored.ndim > 1), default=d)
     for _, stored, _ in by_material(state):
         alone, a = stored.ndim == 1, np.asarray(stored)
         ratios.append(a if alone else np.linalg.det(a) if d > 1 else a[:, 0, 0])
-        gradients.append(a[:, None, None] ** (1 / d) * np.eye(d, dtype=a.dtype) if alone else a)
+        gradients.append(a[:, None, None] ** (1 / k) * np.eye(k, dtype=a.dtype) if alone else a)
     J, F = np.concatenate(ratios), np.concatenate(gradients)
     data = {"velocity": np.pad(v, flat), "J": J, "deformation_gradient": _padded(F, 1.0)}
     if state.C is not None:
@@ -319,7 +320,7 @@ def states_in(rows: dict[str, np.ndarray], like: State) -> State:
         return rows.pop(name).reshape(-1, p, *shape)
 
     def tensors(name: str) -> np.ndarray:
-        return taken(f"VTKHDF/PointData/{name}", 3, 3)[..., :d, :d]
+        return taken(f"VTKHDF/PointData/{name}", 3, 3)
 
     F, J = tensors("deformation_gradient"), taken("VTKHDF/PointData/J")
     history = [
@@ -328,8 +329,8 @@ def states_in(rows: dict[str, np.ndarray], like: State) -> State:
     parts = (
         taken("VTKHDF/Points", 3)[..., :d],
         taken("VTKHDF/PointData/velocity", 3)[..., :d],
-        None if like.C is None else tensors("affine_velocity"),
-        tuple((J if stored.ndim == 1 else F)[:, of] for of, stored, _ in by_material(like)),
+        None if like.C is None else tensors("affine_velocity")[..., :d, :d],
+        tuple((J if a.ndim == 1 else F[..., : a.shape[1], : a.shape[1]])[:, of] for of, a, _ in by_material(like)),
         jax.tree.unflatten(jax.tree.structure(like.histories), history),
     )
     return State(*jax.device_put(parts))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, NodeVector, Scalar
-from mpmjax.discretisation import Stencil, gather, scatter
+from mpmjax.discretisation import Stencil, gather, in_section, in_space, scatter
 
 
 class Displacement:
@@ -29,9 +29,11 @@ class Displacement:
         return jnp.zeros((self.size, self.stencil.dim), self.stencil.offset.dtype)
 
     @cached_property
-    def at_particles(self) -> tuple[Float[Array, "d p"], Float[Array, "d d p"]]:
-        """Σ_i w_ip u_i and Σ_i g_ip u_i, the derivative's direction first."""
-        return gather(self.stencil, self.nodes)
+    def at_particles(self) -> tuple[Float[Array, "d p"], Float[Array, "k k p"]]:
+        """Σ_i w_ip u_i and Σ_i g_ip u_i, the derivative's direction first, in bodies of revolution (3, 3, p)."""
+        value, slopes = gather(self.stencil, self.nodes)
+        radius = self.stencil.radius
+        return value, slopes if radius is None else in_space(radius, value, slopes)
 
 
 class Forces(NamedTuple):
@@ -41,8 +43,15 @@ class Forces(NamedTuple):
     """f_i [N], shape (n, d)."""
     value: Float[Array, "d p"] | None = None
     """a_p [N], shape (d, p)."""
-    slopes: Float[Array, "d d p"] | None = None
-    """a_p,b [J], shape (d, d, p), the derivative's direction b first."""
+    slopes: Float[Array, "k k p"] | None = None
+    """a_p,b [J], shape (d, d, p), the derivative's direction b first; in bodies of revolution (3, 3, p)."""
+
+    def in_section(self, radius: Float[Array, "p"]) -> "Forces":
+        """The forces with matrices in space taken to what a ring gives to the nodes of its section."""
+        if self.slopes is None or len(self.slopes) == 2:
+            return self
+        around, slopes = in_section(radius, self.slopes)
+        return Forces(self.nodes, around if self.value is None else self.value + around, slopes)
 
     def product(self, moved: Displacement) -> Float[Array, ""]:
         """Their work at a displacement [J], or power at a velocity [W]."""
@@ -54,6 +63,8 @@ class Forces(NamedTuple):
 
 def scattered(forces: Sequence[Forces], stencil: Stencil, size: int) -> NodeVector:
     """The sum of forces, one or more, on all nodes [N], shape (n, d)."""
+    if stencil.radius is not None:
+        forces = [force.in_section(stencil.radius) for force in forces]
     parts = ([a for a in field if a is not None] for field in zip(*forces, strict=True))
     nodes, value, slopes = (reduce(jnp.add, part) if part else None for part in parts)
     if value is None and slopes is None:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Int, Matrix, NodeVector, Scalar
+from mpmjax._types import Array, Float, Int, NodeVector, Scalar
 from mpmjax.checks import is_traced, require, require_fields, require_positive, require_that, shape_of, warn
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.geometry import AbstractRegion, surface_pieces
@@ -71,6 +71,17 @@ class AttachedPoints(AbstractPlace):
     def attached(self, particles: Particles) -> "AttachedPoints":
         del particles
         return self
+
+    def revolved(self, particles: Particles) -> "AttachedPoints":
+        """The points of a surface in a section as rings: with 2πr0 times the area."""
+        if self.area is None:
+            return self
+        rows, groups = np.asarray(self.particle).astype(int), particles.groups
+        hoop = np.concatenate(
+            [np.ones(q.rows[1] - q.rows[0]) if q.stored is None else q.stored[:, 2, 2] for q in groups]
+        )
+        length = 2 * np.pi * np.asarray(self.place)[:, 0] / hoop[rows]
+        return eqx.tree_at(lambda p: (p.weight, p.area), self, (self.weight * length, self.area * length[:, None]))
 
 
 class Patch(AbstractPlace):
@@ -216,7 +227,8 @@ def _attached(
     offset = positions - np.asarray(particles.x, float)[particle]
     kept = [np.asarray(F, float) for F in particles.deformations if F is not None and F.ndim == 3]
     if len(kept) == len(particles.deformations):
-        F = np.concatenate(kept)[particle]
+        d = particles.dim
+        F = np.concatenate(kept)[particle, :d, :d]
         offset = np.linalg.solve(F, offset[:, :, None])[:, :, 0]
         if area is not None:
             turned: np.ndarray = (np.swapaxes(F, 1, 2) @ area[:, :, None])[:, :, 0] / np.linalg.det(F)[:, None]
@@ -231,8 +243,9 @@ class LoadedPoints(eqx.Module):
 
     x: Float[Array, "d s"]  # where they are [m]
     v: Float[Array, "d s"]  # their velocity, v_p + C_p r_s, without a C v_p [m/s]
-    deformation: Matrix | None  # F of their particles [-], shape (d, d, s); None where a law does not keep it
-    rate: Matrix | None  # rate of F [1/s], shape (d, d, s); None without a velocity gradient
+    deformation: Float[Array, "k k s"] | None  # F of their particles [-], (d, d, s), of bodies of revolution (3, 3, s);
+    # None where a law does not keep it
+    rate: Float[Array, "k k s"] | None  # rate of F [1/s]; None without a velocity gradient
     place: Float[Array, "d s"]  # where they were when they were attached [m]
     weight: Float[Array, "s"]  # their undeformed areas [m^(d−1)], or shares [-]
     area: Float[Array, "d s"] | None  # outward normal times area of the undeformed surface [m^(d−1)]; None of points

@@ -95,7 +95,10 @@ def fill(
             "fill_mapped."
         )
     require(len(cells[0]) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
-    return _particles(*cells, density, field, precision)
+    x, volume = cells
+    if grid.axisymmetric and not region.fills_bounds:
+        x, volume = x[x[:, 0] > 0], volume[x[:, 0] > 0]  # a ball or disk around the axis by its half
+    return _particles(x, volume, density, field, precision, revolved=grid.axisymmetric)
 
 
 @checked
@@ -107,6 +110,7 @@ def fill_mapped(
     density: Scalar,
     velocity: Velocity | None = None,
     dtype: type | str | None = None,
+    axisymmetric: bool = False,
 ) -> Particles:
     """Fill the image of a box under a smooth map x(ξ) with the images of equal cells: a lattice fitted to any boundary
     that such a map has.
@@ -124,6 +128,7 @@ def fill_mapped(
         box: the box of ξ, in the units of ξ.
         counts: number of cells along each axis of the box.
         density, velocity, dtype: as for `fill`.
+        axisymmetric: whether the image is a section of a body of revolution, by r and z.
 
     Raises:
         ValueError: a map whose Jacobian vanishes or changes its sign in the box, counts that are no whole numbers, or
@@ -154,7 +159,8 @@ def fill_mapped(
     )
     part = np.abs(jacobian).reshape(-1, len(share)) * share
     x = np.einsum("mq,mqd->md", part, np.asarray(mapped, float).reshape(*part.shape, d))
-    return _particles(x / part.sum(axis=1)[:, None], part.sum(axis=1) * volume, density, field, precision)
+    x, volume = x / part.sum(axis=1)[:, None], part.sum(axis=1) * volume
+    return _particles(x, volume, density, field, precision, revolved=axisymmetric)
 
 
 def _precision(dtype: type | str | None) -> Any:
@@ -215,8 +221,13 @@ def _cut_cells(region: AbstractRegion, size: np.ndarray) -> tuple[np.ndarray, np
     return moment[kept] / total[kept][:, None], total[kept] * volume[kept.reshape(-1)]
 
 
-def _particles(x: np.ndarray, volume: np.ndarray, density: Scalar, velocity: Velocity, dtype: Any) -> Particles:
-    """Particles at x [m], (p, d), of volumes [m^d], (p,), alike in density."""
+def _particles(
+    x: np.ndarray, volume: np.ndarray, density: Scalar, velocity: Velocity, dtype: Any, *, revolved: bool
+) -> Particles:
+    """Particles at x [m], (p, d), of volumes [m^d], (p,), alike in density; if `revolved`, rings of these sections."""
+    if revolved:  # exact, x being the centroid (Pappus)
+        require(x[:, 0] > 0, f"Bodies of revolution must lie at r > 0, got a particle at r = {x[:, 0].min():g} m.")
+        volume = 2 * np.pi * x[:, 0] * volume
     x, volume, C = np.asarray(x, dtype), np.asarray(volume, dtype), None
     xp = jnp if is_traced((density, velocity)) else np  # each operation of JAX by itself is a program to compile
     if callable(velocity):

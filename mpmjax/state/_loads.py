@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector, ParticleVector, Point, Scalar, components
 from mpmjax.checks import require, require_fields, require_that, shape_of
-from mpmjax.discretisation import Stencil
+from mpmjax.discretisation import Stencil, in_space
 from mpmjax.geometry import (
     AbstractMotion,
     Changing,
@@ -39,6 +39,8 @@ class AbstractLoad(eqx.Module):
     """Where it acts."""
     moves_points_on: ClassVar[bool] = True
     """Whether `force` has the points where they are at its time t; else where they are as the step begins."""
+    may_be_revolved: ClassVar[bool] = True
+    """Whether it may act on bodies of revolution, points of which are rings."""
 
     @abc.abstractmethod
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"] | None:
@@ -157,7 +159,8 @@ class Pressure(AbstractLoad):
         if area is None:
             raise ValueError("Pressure acts on a surface: give it a Patch, not points.")
         if self.following and F is not None:
-            area = la.matmul(la.cofactor(F), area[:, None])[:, 0]
+            d = len(area)
+            area = la.matmul(la.cofactor(F)[:d, :d], area[:, None])[:, 0]
         return -value_at(self.pressure, t) * area
 
 
@@ -270,9 +273,9 @@ def points_of(
     total: bool,
 ) -> tuple[LoadedPoints, ...]:
     """The points of each load of prepared particles at the start of a step."""
-    dtype, F = particles.x.dtype, None
+    d, dtype, F = particles.dim, particles.x.dtype, None
     if loads and any(keeps_deformation(law) for law in laws):
-        still, parts = jnp.eye(particles.dim, dtype=dtype), []  # the identity where a law does not keep it
+        still, parts = jnp.eye(stencil.strain_dim, dtype=dtype), []  # the identity where a law does not keep it
         for law, stored, count in zip(laws, particles.deformations, particles.sizes, strict=True):
             whole = keeps_deformation(law) and stored is not None
             parts.append(jnp.asarray(stored) if whole else jnp.broadcast_to(still, (count, *still.shape)))
@@ -282,13 +285,14 @@ def points_of(
         rows = jnp.asarray(on.particle, dtype).astype(jnp.int32)
         offset = jnp.asarray(on.offset, dtype).T
         deformation = None if F is None else components(F[rows])
-        arm = offset if deformation is None else la.matmul(deformation, offset[:, None])[:, 0]
+        arm = offset if deformation is None else la.matmul(deformation[:d, :d], offset[:, None])[:, 0]
         r = offset if total else arm
         v, rate = components(particles.v[rows]), None
         if particles.C is not None:
             C = components(particles.C[rows])
             v = v + la.matmul(C, r[:, None])[:, 0]
-            rate = None if deformation is None else C if total else la.matmul(C, deformation)
+            L = C if stencil.radius is None else in_space(stencil.radius[rows], components(particles.v[rows]), C)
+            rate = None if deformation is None else L if total else la.matmul(L, deformation)
         return LoadedPoints(
             x=components(particles.x[rows]) + arm,
             v=v,
@@ -353,6 +357,7 @@ class Couple(AbstractLoad):
     on: AbstractPlace
     total: Scalar | Point | TimeSeries
     moves_points_on: ClassVar[bool] = False  # forces act on the nodes as the step begins
+    may_be_revolved: ClassVar[bool] = False
 
     def __check_init__(self):
         require_fields(self)

@@ -44,7 +44,12 @@ def attach(scene: Scene, particles: Particles) -> Scene:
     if not scene.loads:
         return scene
     with jax.ensure_compile_time_eval():  # what is known stays so within a transformation
-        loads = tuple(eqx.tree_at(lambda load: load.on, load, load.on.attached(particles)) for load in scene.loads)
+        flat = replace(particles, volume=scene.grid.section(particles.x, particles.volume))
+        places = [load.on.attached(flat) for load in scene.loads]
+        if scene.grid.axisymmetric:
+            places = [place.revolved(particles) for place in places]
+        each = zip(scene.loads, places, strict=True)
+        loads = tuple(eqx.tree_at(lambda load: load.on, load, place) for load, place in each)
     return eqx.tree_at(lambda s: s.loads, scene, loads)
 
 
@@ -87,7 +92,8 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     )
     # of known numbers NumPy makes arrays: each operation of JAX by itself is a program to compile
     xp: Any = jnp if is_traced((scene, particles)) else np
-    materials = [_prepared(law, group, particles, xp) for law, group in zip(scene.laws, particles.groups, strict=True)]
+    common, pairs = (particles.x.dtype, scene.grid.strain_dim, xp), zip(scene.laws, particles.groups, strict=True)
+    materials = [_prepared(law, group, *common) for law, group in pairs]
     C = particles.C
     if scene.keeps_gradient and C is None:
         C = jax.device_put(xp.zeros((p, d, d), particles.x.dtype))
@@ -110,7 +116,7 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     if not is_traced((scene, prepared)):
         _check_placement(scene, prepared)
         if first:
-            warn_of_setup(scene, prepared)
+            warn_of_setup(scene, replace(prepared, volume=scene.grid.section(prepared.x, prepared.volume)))
     if not scene.keeps_gradient or particles.C is not None or moves_as_one(particles):
         return prepared
     return replace(prepared, C=velocity_gradient(scene, prepared))
@@ -142,8 +148,9 @@ def _check_loads(scene: Scene, particles: Particles) -> None:
             )
 
 
-def _prepared(law: AbstractLaw, group: Group, particles: Particles, xp: Any) -> tuple[Array, Any]:
-    """Deformation and history of one material's particles, of which `xp`, NumPy or JAX, makes what is missing."""
+def _prepared(law: AbstractLaw, group: Group, dtype: Any, dim: int, xp: Any) -> tuple[Array, Any]:
+    """Deformation, with so many rows, and history of one material's particles, of which `xp`, NumPy or JAX, makes what
+    is missing."""
     start, stop = group.rows
     leaves = jax.tree.leaves(law, is_leaf=is_foreign)  # the numbers of networks and the like are their own
     shapes, fitting = {jnp.shape(a) for a in leaves if eqx.is_array_like(a)}, {(), (1,), (stop - start,)}
@@ -154,10 +161,10 @@ def _prepared(law: AbstractLaw, group: Group, particles: Particles, xp: Any) -> 
         "within the law.",
     )
     kept = law.measure
-    undeformed = kept.undeformed(particles.dim)
+    undeformed = kept.undeformed(dim)
     shape, stored = (stop - start, *undeformed.shape), group.stored
     if stored is None:
-        stored = jax.device_put(xp.broadcast_to(undeformed.astype(particles.x.dtype), shape))
+        stored = jax.device_put(xp.broadcast_to(undeformed.astype(dtype), shape))
     require(stored.shape == shape, f"{law.title()} needs {kept.symbol} of shape {shape}, got {stored.shape}.")
     if group.history is not None and law.remembers(group.history, stored):
         return stored, group.history
@@ -173,7 +180,7 @@ def is_prepared(scene: Scene, particles: Particles) -> bool:
     """Whether the particles have exactly what the scene needs."""
 
     def fits(law: AbstractLaw, group: Group) -> bool:
-        shape = law.measure.undeformed(particles.dim).shape
+        shape = law.measure.undeformed(scene.grid.strain_dim).shape
         stored = group.stored
         return stored is not None and stored.shape[1:] == shape and law.remembers(group.history, stored)
 

@@ -34,6 +34,7 @@ from mpmjax.discretisation import (
 from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw
 from mpmjax.potential import MirrorPlace, carried_by
+from mpmjax.state._axis import check_axis, with_axis
 from mpmjax.state._constraint import AbstractConstraint
 from mpmjax.state._loads import AbstractBodyForce, AbstractLoad
 from mpmjax.state._material_points import AveragedVolume, MaterialPoints, VolumeAverage, volume_average
@@ -185,6 +186,8 @@ class Scene(eqx.Module):
         self.grid = grid if grid.layers == layers else grid.with_layers(layers)
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
         self.boundary = (boundary,) if isinstance(boundary, AbstractBoundary) else tuple(boundary)
+        if grid.axisymmetric:
+            self.boundary = with_axis(self.boundary, grid)
         self.kernel = kernel
         rough = description.total and kernel == BSpline(2)  # where moving least squares is
         self.gradient = gradient or (SplineGradient() if rough else MLSGradient())
@@ -215,6 +218,9 @@ class Scene(eqx.Module):
             boundary.check(self.grid, total=self.total)
         for load in self.loads:
             load.check(d)
+        if self.grid.axisymmetric:
+            several = self.bodies is not None or len(self.constraints) > 0
+            check_axis(self.gravity, self.loads, bodies=several)
         for axis in range(d if not self.total else 0):
             motions = [mirror.motion for mirror in self.mirrors if mirror.axis == axis]
             require(

@@ -127,8 +127,9 @@ def warn_of_rounding(grid: Grid, x: ParticleVector, before: ParticleVector | Non
 def warn_of_crowding(scene: Scene, particles: Particles) -> None:
     """Warn of particles that take much more space than there is, after a run in the updated description. A law sees the
     volume of each particle by itself, and not that they crowd."""
-    volume = np.asarray(particles.volume, float) * np.concatenate(_ratios(scene.laws, particles))
-    side = float(np.asarray(particles.volume).max()) ** (1 / particles.dim)
+    undeformed = np.asarray(scene.grid.section(particles.x, particles.volume), float)
+    volume = undeformed * np.concatenate(_ratios(scene.laws, particles))
+    side = float(undeformed.max()) ** (1 / particles.dim)
     for offset in (0.0, 0.5):  # a layer between two rows of nodes shows less
         filled = _filled(np.asarray(particles.x), volume, max(float(scene.grid.spacing), 2 * side), offset)
         beyond = 0.0 if filled is None else np.maximum(filled[0] - _CROWDED, 0).sum() / filled[0].sum()

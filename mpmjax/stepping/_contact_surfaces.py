@@ -26,10 +26,15 @@ def faces_of(
     """The faces of prepared particles in a step from t. Forces are evaluated at the share `force_at` of the step's
     displacement; None if the step is explicit."""
     materials, shapes, areas, explicit = potential.material_points, [], [], force_at is None
-    factor = EXPLICIT_STIFFNESS if explicit else IMPLICIT_STIFFNESS
+    factor, radius = EXPLICIT_STIFFNESS if explicit else IMPLICIT_STIFFNESS, potential.stencil.radius
+    d = particles.x.shape[1]
     for law, points in zip(scene.laws, materials, strict=True):
-        side = points.volume ** (1 / potential.stencil.dim)
-        shape = points.deformation if law.allows_total else points.volume_ratio()
+        size = points.volume
+        if radius is not None:  # the section of a ring, undeformed where F says how far it has grown
+            now = 2 * jnp.pi * points.rows_of(radius)
+            size = size / now * (points.deformation[2, 2] if law.allows_total and not points.total else 1)
+        side = size ** (1 / d)
+        shape = points.deformation[:d, :d] if law.allows_total else points.volume_ratio()
         shapes.append(FaceShape(side / 2, shape, points.rows, points.total, law.flows))
         # of a sliver A = V0/l0 is large for its mass, and would shorten explicit steps
         areas.append(points.volume / (side.max(initial=0) if explicit else side))

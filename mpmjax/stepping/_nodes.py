@@ -18,7 +18,7 @@ from mpmjax.boundary import (
     combined_conditions,
     mirror,
 )
-from mpmjax.discretisation import Stencil, p2g, scatter
+from mpmjax.discretisation import Stencil, in_section, in_space, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.potential import AbstractTerm, Forces, Mirror
 from mpmjax.state import AbstractLayerImage, Particles, Scene, load_force, points_of, terms_of
@@ -196,15 +196,19 @@ def particles_to_grid(
     potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), size)
     flux = potential.weighted_stress()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
     if explicit_viscosity and C is not None and potential.material_viscous:
-        flux = flux + potential.weighted_viscous_stress(C)
+        L = C if stencil.radius is None else in_space(stencil.radius, v, C)
+        flux = flux + potential.weighted_viscous_stress(L)
     gravity, body_force = jnp.asarray(scene.gravity), None
     if scene.body_force is not None:
         x = particles.x + body_force_at * dt * particles.v if body_force_at else particles.x
         body_force = components(scene.body_force.acceleration(x, t + body_force_at * dt if body_force_at else t))
     if joined:
         v = v + dt * (gravity[:, None] if body_force is None else gravity[:, None] + body_force)
-    affine = C if scene.transfer.affine else None
-    mass, v = p2g(stencil, particles.mass, v, affine, size, -dt * flux if joined else None)
+    affine, impulse = C if scene.transfer.affine else None, -dt * flux if joined else None
+    if stencil.radius is not None and impulse is not None:
+        around, impulse = in_section(stencil.radius, impulse)
+        v = v + around / particles.mass
+    mass, v = p2g(stencil, particles.mass, v, affine, size, impulse)
     nodes = Nodes(
         mass=mass,
         v=v,
@@ -306,5 +310,6 @@ def start_nodes(
 def places_of(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
     """Current positions of reference nodes, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) / m_i [m], shape (n, d); zero on empty
     nodes."""
-    F = jnp.concatenate([group.deformation() for group in particles.groups], axis=-1)
+    d = particles.dim
+    F = jnp.concatenate([group.deformation()[:d, :d] for group in particles.groups], axis=-1)
     return p2g(stencil, particles.mass, components(particles.x), F, size)[1]

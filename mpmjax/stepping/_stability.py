@@ -12,7 +12,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeScalar, Scalar
 from mpmjax.boundary import STIFFNESS, AbstractContact, ConstrainedNodes, series_stiffness
 from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_positive
-from mpmjax.discretisation import Stencil, gather
+from mpmjax.discretisation import Stencil
 from mpmjax.geometry import length
 from mpmjax.potential import Mirror
 from mpmjax.state import MaterialPoints, Particles, Scene, is_prepared, points_of, prepare, terms_of
@@ -164,12 +164,12 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator, t: Sc
     density, stencil = particles.mass / particles.volume, scene.stencil(particles, t)
     elastic_steepness, viscous_steepness = _steepness(scene, stencil)
     materials = scene.material_points(particles, t)
-    stiffest = jnp.concatenate([points.stiffest(particles.dim) for points in materials])
+    stiffest = jnp.concatenate([points.stiffest(scene.grid.strain_dim) for points in materials])
     z, viscous = stiffest * elastic_steepness / density, []  # per Δt²
     for points in materials:  # the largest eigenvalue of ∇v ↦ |J| σ_v [Pa s], in the total description a bound of it
         most = jnp.zeros_like(points.volume)
         if points.viscosity is not None:
-            most = jnp.abs(points.volume_ratio()) * points.viscosity.stiffest(particles.dim)
+            most = jnp.abs(points.volume_ratio()) * points.viscosity.stiffest(scene.grid.strain_dim)
             most = most / (la.principal_frame(points.deformation)[1] ** 2).min(axis=0) if points.total else most
         viscous.append(most)
     y = jnp.concatenate(viscous) * viscous_steepness / density  # per Δt
@@ -184,7 +184,7 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator, t: Sc
         terms = tuple(spring for spring in springs if spring is not None)
         pushed = nodes.constrained(Mirror(()), nodes.mass, nodes.conditions.fixed, terms)
         a = pushed.projection.combine(pushed.per_mass(pushed.force) + pushed.acceleration, 0.0)
-        slopes = gather(stencil, nodes.potential.mirror.unfold(a))[1]
+        slopes = nodes.potential.displaced(a).at_particles[1]
         rates, fastest = la.symmetric_eigen((slopes + la.transpose(slopes)) / 2)[0], []
         for law, points in zip(scene.laws, materials, strict=True):
             r = points.rows_of(rates)
@@ -259,4 +259,9 @@ def _steepness(scene: Scene, stencil: Stencil) -> tuple[Array, Array]:
     if bound is None or bounds is None:
         culprit = scene.gradient if bound is None else scene.transfer
         raise UnknownBoundError(f"{type(culprit).__name__} gives no bound on the step: give dt.")
-    return bounds
+    if stencil.radius is None:
+        return bounds
+    # a hoop alone has 1/r² < a; before the mirror at the axis, where it strains with ∂u_r/∂r, it adds 1/(D + r²)
+    near = stencil.radius < (scene.kernel.order - 1) / 2 * spacing
+    hoop = jnp.where(near, 1 / (1 / inverse_moment + stencil.radius**2), 0)
+    return bounds[0] + hoop, bounds[1] + 4 * hoop

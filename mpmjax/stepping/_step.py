@@ -13,7 +13,7 @@ from mpmjax._types import Array, Float, Int, NodeVector, Scalar, components, par
 from mpmjax.autodiff import without_derivative
 from mpmjax.boundary import ContactInfo, Impulses
 from mpmjax.checks import canonical, checked, require_finite, require_placement, require_positive
-from mpmjax.discretisation import Stencil, g2p, scatter
+from mpmjax.discretisation import Stencil, g2p, in_space, scatter
 from mpmjax.implicit import SolveInfo
 from mpmjax.potential import Forces
 from mpmjax.state import Particles, Scene, State, is_prepared, prepare, with_state
@@ -140,7 +140,8 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
         C=None if particles.C is None else components(particles.C),
         keep_gradient=scene.keeps_gradient,
     )
-    grad_v = gathered.gradient
+    grad_v, radius = gathered.gradient, potential.stencil.radius
+    grad_v = grad_v if radius is None else in_space(radius, gathered.carrier, grad_v)
     after = State(
         x=particle_first(components(particles.x) + dt * gathered.carrier),
         v=particle_first(gathered.velocity),

@@ -281,13 +281,22 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
     from matplotlib.collections import EllipseCollection
 
     assert run.frames is not None
-    d = run.final.dim
-    x = np.asarray(run.frames.x).reshape(-1, d)
-    volume = np.asarray(run.final.volume, float)
+    d, grid = run.final.dim, run.scene.grid
+    volume = np.asarray(grid.section(run.frames.x[0], run.final.volume), float)
+
+    def whole(x: np.ndarray) -> np.ndarray:
+        """Points with those on the other side of the axis of a body of revolution."""
+        return np.concatenate([x, x * (-1, 1)]) if grid.axisymmetric else x
+
+    x = whole(np.asarray(run.frames.x).reshape(-1, d))
     margin = float(volume.mean()) ** (1 / d)
     lower, upper = x.min(axis=0) - 2 * margin, x.max(axis=0) + 2 * margin
     extent = float((upper - lower).max())
     walls = [wall for boundary in run.scene.boundary for wall in boundary.walls()]
+    if grid.axisymmetric:
+        around = [wall for wall in walls if wall.axis == 0 and wall.position != 0]
+        across = [wall._replace(position=-wall.position, inward=-wall.inward) for wall in around]
+        walls = [wall for wall in walls if wall.axis == 1] + around + across
     for axis, at, *_ in walls:  # those near by are shown
         if lower[axis] - extent < at < upper[axis] + extent:
             lower[axis], upper[axis] = min(lower[axis], at - 0.03 * extent), max(upper[axis], at + 0.03 * extent)
@@ -298,17 +307,18 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
     shape = 2.0 if d == 1 else float(np.clip((upper - lower)[0] / (upper - lower)[1], 0.5, 2.0))
     figure = plt.figure(figsize=(4.2 * shape + 1.6, 4.8), layout="constrained")
     axes: Any = figure.add_subplot()
-    axes.set(xlabel="x [m]", xlim=(lower[0], upper[0]))
+    axes.set(xlabel="r [m]" if grid.axisymmetric else "x [m]", xlim=(lower[0], upper[0]))
     axes.set(
         **{"yticks": [], "ylim": (-1, 1)}
         if d == 1
-        else {"ylabel": "y [m]", "ylim": (lower[1], upper[1]), "aspect": "equal"}
+        else {"ylabel": "z [m]" if grid.axisymmetric else "y [m]", "ylim": (lower[1], upper[1]), "aspect": "equal"}
     )
     for axis, at, side, _ in walls:
         line, span = (axes.axvline, axes.axvspan) if axis == 0 else (axes.axhline, axes.axhspan)
         line(at, color=STONE, lw=1.5, zorder=3)
         span(at, at - side * 1e3 * extent, color=STONE, alpha=0.35, lw=0)
     width = volume if d == 1 else 2 * np.sqrt(volume / np.pi)
+    width = np.concatenate([width, width]) if grid.axisymmetric else width
     disks: Any = EllipseCollection(
         width, width, 0.0, units="x", offsets=np.zeros((1, 2)), offset_transform=axes.transData
     )
@@ -319,13 +329,16 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
     stones: list[Any] = []
 
     def draw(particles: Particles, values: np.ndarray, t: float) -> None:
-        place = np.asarray(particles.x)
+        place = whole(np.asarray(particles.x))
         disks.set_offsets(place if d == 2 else np.column_stack([place, np.zeros(len(place))]))
-        disks.set_facecolor(_tinted(particles, bar, values))
+        colours = _tinted(particles, bar, values)
+        disks.set_facecolor(np.concatenate([colours, colours]) if grid.axisymmetric else colours)
         while stones:
             stones.pop().remove()
         for distance in _obstacles(run.scene, t) if d == 2 else ():
-            inside = distance(lattice.reshape(-1, d)).reshape(lattice.shape[:-1])
+            there = lattice.reshape(-1, d)
+            there = np.column_stack([np.abs(there[:, 0]), there[:, 1]]) if grid.axisymmetric else there
+            inside = distance(there).reshape(lattice.shape[:-1])
             stones.append(axes.contourf(*lattice.T.swapaxes(1, 2), inside, [-np.inf, 0.0], colors=[STONE]))
         axes.set_title(f"t = {t:.4g} s")
 
