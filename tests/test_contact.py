@@ -9,8 +9,7 @@ from helpers import QUICK, assert_close, explicit_limit, ids, thorough
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary._contact import ConstrainedNodes, constrain, count_places
-from mpmjax.boundary._friction import friction_change, friction_share
+from mpmjax.boundary._contact import ConstrainedNodes, constrain, count_places, friction_change, friction_share
 from mpmjax.boundary._planes import column_weight
 from mpmjax.checks._values import canonical
 from mpmjax.implicit import Projection, no_solve

@@ -104,9 +104,12 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
             return cross(place, np.asarray(impulse)).sum(axis=0)
 
         pivots = np.stack([np.asarray(m.centre) + np.asarray(m.at((n + late) * dt)) for m in motions])
-        rubbed = () if new.contact is None else step.held.pushes(new.friction)
         turning = [n for n, one in enumerate(scene.boundary) if one.collider_count]
-        rub = sum(np.asarray(given) for number, given in rubbed if number in turning)  # by springs and friction
+        each = zip(step.nodes.brought_by, step.nodes.contacts, step.held.active, new.friction, strict=True)
+        rub = 0
+        for _, contact, active, slip in (contact for contact in each if contact[0] in turning):
+            spring = contact.spring_impulse(step.held, active)
+            rub = rub + mass * np.asarray(slip) + (0 if spring is None else np.asarray(spring))
         holding = np.asarray(step.holding)
         friction = np.asarray(step.friction)
         push = sum(np.asarray(given.impulse) for given in step.held.along_normals(step.holding))

@@ -11,7 +11,7 @@ from helpers import assert_close
 import mpmjax as mpm
 from mpmjax import linalg as la
 from mpmjax.checks._values import canonical
-from mpmjax.material._von_mises import _share_of_flow
+from mpmjax.material._hencky import _share_of_flow
 
 E, NU = 1e4, 0.3
 MU = E / (2 * (1 + NU))
@@ -106,7 +106,7 @@ def random_states(d, p=200):
 
 
 @pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.thorough)])
-def test_without_viscosity_it_is_von_mises(d):
+def test_without_viscosity_it_is_hencky(d):
     """η = 0: F after the return is that of σ_y = √3 τ_Y, to rounding; a small η is near it, in proportion to η."""
     F, transverse = random_states(d)
     transverse = None if d == 3 else transverse

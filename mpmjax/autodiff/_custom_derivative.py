@@ -21,6 +21,8 @@ transposes, or of functions that have a rule for that too:
         ...
 
 Rules are written for one member of a batch: `jax.vmap` maps the function, or its rule.
+
+At the end: what a program stores, and what reverse mode computes again.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -31,6 +33,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jax.dtypes import float0
 
 from mpmjax._jax import (
@@ -362,3 +365,21 @@ _stored = custom_derivative(
 )
 _stored.defjvp(lambda primals, tangents: (_stored(*primals), _some_stored(tangents)))
 _stored.deftranspose(lambda cotangents, args: (*_some_stored(cotangents),))
+
+
+_SAVED, _SUMS = "mpmjax_saved", "mpmjax_sums"
+
+
+def rematerialised(step: Callable[..., Any], *, sums: bool = False) -> Callable[..., Any]:
+    """The step of a `jax.lax.scan`, of which reverse mode stores what it starts from and what is `saved_for_backward`.
+    The rest is computed again, which takes less time than to store it and to read it back. With `sums`, where few steps
+    are stored at once, sums are too."""
+    names = (_SAVED, *([_SUMS] if sums else []))
+    return jax.checkpoint(step, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(*names))
+
+
+def saved_for_backward(tree: Any, *, sums: bool = False) -> Any:
+    """The tree, its arrays not computed again in the steps of `rematerialised`: the results of iterations, or sums over
+    stencils, which may be stored."""
+    name = _SUMS if sums else _SAVED
+    return jax.tree.map(lambda leaf: checkpoint_name(leaf, name) if isinstance(leaf, jax.Array) else leaf, tree)

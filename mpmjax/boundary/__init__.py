@@ -34,8 +34,9 @@ from mpmjax.boundary._contact import (
     ContactInfo as ContactInfo,
     constrain as constrain,
     count_places as count_places,
+    friction_change as friction_change,
+    friction_share as friction_share,
 )
-from mpmjax.boundary._friction import friction_change as friction_change, friction_share as friction_share
 from mpmjax.boundary._impulses import (
     Impulses as Impulses,
     OwnedCouple as OwnedCouple,

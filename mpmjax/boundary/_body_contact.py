@@ -22,8 +22,7 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
-from mpmjax.boundary._contact import AbstractSpringContact, ConstrainedNodes
-from mpmjax.boundary._friction import friction_share
+from mpmjax.boundary._contact import AbstractSpringContact, ConstrainedNodes, friction_share
 from mpmjax.discretisation import Grid, Stencil
 from mpmjax.potential import AbstractSpring, Displacement, Forces, Mirror
 

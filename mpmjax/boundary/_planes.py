@@ -11,8 +11,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
-from mpmjax.boundary._contact import AbstractContact, AbstractNodes, ConstrainedNodes
-from mpmjax.boundary._friction import friction_change
+from mpmjax.boundary._contact import AbstractContact, AbstractNodes, ConstrainedNodes, friction_change
 from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
 from mpmjax.discretisation import Grid, scatter

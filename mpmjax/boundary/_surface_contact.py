@@ -18,8 +18,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, NodeScalar, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary._contact import AbstractSpringContact, ConstrainedNodes
-from mpmjax.boundary._friction import friction_change
+from mpmjax.boundary._contact import AbstractSpringContact, ConstrainedNodes, friction_change
 from mpmjax.checks import require
 from mpmjax.discretisation import Stencil, scatter
 from mpmjax.geometry import length

@@ -11,7 +11,7 @@ from mpmjax.material._elastic import (
     FixedCorotated as FixedCorotated,
     NeoHookean as NeoHookean,
 )
-from mpmjax.material._fluid import AbstractVolumetric as AbstractVolumetric, Fluid as Fluid
+from mpmjax.material._fluid import AbstractVolumetric as AbstractVolumetric, Fluid as Fluid, Viscous as Viscous
 from mpmjax.material._granular import (
     CamClay as CamClay,
     CamClayHistory as CamClayHistory,
@@ -21,7 +21,13 @@ from mpmjax.material._granular import (
     SnowElasticity as SnowElasticity,
     SnowHistory as SnowHistory,
 )
-from mpmjax.material._hencky import AbstractHenckyPlasticity as AbstractHenckyPlasticity, Hencky as Hencky
+from mpmjax.material._hencky import (
+    AbstractHenckyPlasticity as AbstractHenckyPlasticity,
+    Hencky as Hencky,
+    HerschelBulkley as HerschelBulkley,
+    VonMises as VonMises,
+    VonMisesHistory as VonMisesHistory,
+)
 from mpmjax.material._law import (
     AbstractInelastic as AbstractInelastic,
     AbstractLaw as AbstractLaw,
@@ -35,10 +41,4 @@ from mpmjax.material._rubber import (
     MooneyRivlin as MooneyRivlin,
     Ogden as Ogden,
     Yeoh as Yeoh,
-)
-from mpmjax.material._viscous import Viscous as Viscous
-from mpmjax.material._von_mises import (
-    HerschelBulkley as HerschelBulkley,
-    VonMises as VonMises,
-    VonMisesHistory as VonMisesHistory,
 )

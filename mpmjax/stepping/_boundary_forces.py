@@ -12,7 +12,7 @@ from mpmjax.boundary import (
     taken_by_mirrors,
 )
 from mpmjax.discretisation import Gathered
-from mpmjax.potential import Image
+from mpmjax.potential import Image, Mirror
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping._grid_update import GridUpdate, reaction
 from mpmjax.stepping._integrator import AbstractIntegrator
@@ -30,9 +30,14 @@ def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator,
         pivots = pivots + share * nodes.dt * colliders.pivot_velocity
     held, numbers = new.held(nodes), _boundaries_of_colliders(scene)
     holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
-    pushes = () if new.contact is None else held.pushes(new.friction)
-    by_springs = [OwnedImpulse(push, numbers.index(number)) for number, push in pushes if number in numbers]
-    parts = [OwnedImpulse(holding, colliders.holder), *held.along_normals(holding), *by_springs]
+    parts = [OwnedImpulse(holding, colliders.holder), *held.along_normals(holding)]
+    mass, tied = (nodes if nodes.loose is None else nodes.loose).mass[:, None], Mirror(nodes.tied)
+    for number, contact, active, change in zip(
+        nodes.brought_by, nodes.contacts, held.active, new.friction, strict=True
+    ):
+        if number in numbers:  # by springs and friction
+            rubbed, impulse = mass * tied.unfold(change), contact.spring_impulse(held, active)
+            parts.append(OwnedImpulse(rubbed if impulse is None else rubbed + impulse, numbers.index(number)))
     return received_impulses(parts, position, pivots)
 
 
