@@ -93,8 +93,8 @@ def settled(law: mpm.material.AbstractLaw, kind: str, at: float, times: float, s
 def rest(cells: int = 8) -> None:
     """Water that starts in its exact state stays in it: the error of the pressure and the centre's height."""
     print("water at rest, K = 40 ρgH, after 2 s: wall, spacings from a node, times the explicit limit;")
-    print("rms error of the pressure over the last half second [% of ρgH] (in explicit steps")
-    print("mostly sound that still rings), height of the centre over the exact one, pressure of the lowest row")
+    print("rms error of the pressure over the last half second [% of ρgH], height of the centre over the exact one,")
+    print("pressure of the lowest row over its own")
     law = mpm.Fluid(40 * WATER * G * cells / 32)
     for kind, at, times in (
         *(("SeparatingBox", at, times) for at in (0.0, 0.1, 0.25, 0.5) for times in (0.7, 9.0)),

@@ -346,7 +346,9 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
                 rubbed, by_contact[k] = rubbed + change, change
             by_order.append(by_contact)
         total = [reduce(jnp.add, each) / len(orders) for each in zip(*by_order, strict=True)]
-        return self.images.unfold(sum(total, v)), tuple(map(self.images.unfold, total))
+        # v has been unfolded: its changes follow the walls, and are not scaled again
+        walls = Mirror(tuple(image for image in self.images.images if isinstance(image, WallImage)))
+        return v + walls.unfold(sum(total)), tuple(map(walls.unfold, total))
 
 
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:

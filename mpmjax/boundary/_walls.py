@@ -157,8 +157,8 @@ class SeparatingBox(AbstractBox):
 
     Walls lie anywhere, and have derivatives by their place.
 
-    In implicit steps a fluid is held as by a `ContactPlane`, but with walls anywhere, so that it stays at rest: its
-    impact is without bounce, and its motion has no derivative by a wall's place. Explicit steps push its faces.
+    A fluid is held as by a `ContactPlane`, but with walls anywhere, so that it stays at rest: its impact is without
+    bounce, and its motion has no derivative by a wall's place.
 
     *When it breaks*: particles that start nearer to a wall than half their width are pushed away as if they were
     compressed by that much. A pressure of a twentieth of M presses by more than 2 % of a spacing.
@@ -196,12 +196,11 @@ class SeparatingBox(AbstractBox):
     def contacts(
         self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
     ) -> tuple[AbstractContact, ...]:
-        """Springs, and in implicit steps, for what flows, two walls an axis that hold the columns of nodes whose gap is
-        shut; as at a `ContactPlane` springs push it in the step that would bring its faces behind a wall. In explicit
-        steps stirred water would rise between such walls."""
+        """Springs, and for what flows two walls an axis that hold the columns of nodes whose gap is shut; as at a
+        `ContactPlane` springs push it in the implicit step that would bring its faces behind a wall."""
         assert faces is not None  # as it `pushes`
         surfaces = tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
-        if faces.explicit or not any(shape.flows for shape in faces.shapes):
+        if not any(shape.flows for shape in faces.shapes):
             return surfaces
         flowing = np.repeat([shape.flows for shape in faces.shapes], [len(shape.half) for shape in faces.shapes])
         shut = jnp.stack([flowing & (surface.gap <= SHUT * faces.spacing) for surface in surfaces])
@@ -209,7 +208,8 @@ class SeparatingBox(AbstractBox):
         around = scatter(faces.stencil, shut.reshape(-1, len(flowing)).astype(faces.x.dtype), None, grid.size)
         contacts: list[AbstractContact] = []
         for axis, surface in enumerate(surfaces):
-            contacts.append(replace(surface, beside=~shut[axis]))
+            if not (faces.explicit and flowing.all()):
+                contacts.append(replace(surface, beside=~shut[axis]))
             stencil = faces.stencil.along(axis)
             volume = jnp.where(flowing, 2 * faces.width(surface.normal)[0], 0) ** self.dim
             slope = scatter(stencil, None, volume[None, None], stencil.basis.shape[0])[:, 0]

@@ -201,6 +201,12 @@ class Mirror(eqx.Module):
             field = image.fold(field)
         return field
 
+    def unscaled(self, field: NodeVector) -> NodeVector:
+        """A velocity of true nodes, as that of which `unfold` makes it by its scaling."""
+        for image in self.images:
+            field = field / image.factor if isinstance(image, Scaling) else field
+        return field
+
     @property
     def moving(self) -> tuple[tuple[Image, Scalar], ...]:
         """The mirrors that move, with their velocities [m/s]."""

@@ -72,7 +72,8 @@ class StageFriction(eqx.Module):
         # the share γ of an impulse on a mass is that impulse on 1/γ of the mass
         rubbed, loose = (each and replace(each, mass=each.mass / share) for each in (rubbed, rubbed.loose))
         held = replace(self.held, displacement=u / 2, nodes=replace(rubbed, loose=loose))
-        return jnp.where(rubbed.occupied, held.friction(v, held.without_spring_impulses(missing))[0] - v, 0)
+        change = held.friction(v, held.without_spring_impulses(missing))[0] - v
+        return jnp.where(rubbed.occupied, held.images.unscaled(change), 0)
 
 
 def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
