@@ -23,16 +23,13 @@ class GridUpdate(eqx.Module):
     """The motion of the nodes over a step, mirrored at active contact planes."""
 
     motion: NodeMotion
-    solved: NodeMotion
-    """`motion` before friction."""
+    solved: NodeMotion  # `motion` before friction
     elastic: NodeVector | None
     """The impulse of elastic forces (see `AbstractIntegrator.elastic_impulse`) [kg m/s], shape (n, d); None if P2G
     summed momentum and force together."""
     solve: SolveInfo
-    constrained: ConstrainedNodes | None = None
-    """The nodes with the active set held; None in a scene without contact."""
-    friction: tuple[NodeVector, ...] = ()
-    """The change of velocity by the friction of each contact [m/s], shape (n, d)."""
+    constrained: ConstrainedNodes | None = None  # the nodes with the active set held; None in a scene without contact
+    friction: tuple[NodeVector, ...] = ()  # the change of velocity by the friction of each contact [m/s], shape (n, d)
     contact: ContactInfo | None = None
 
     def held(self, nodes: Nodes) -> ConstrainedNodes:
@@ -49,8 +46,7 @@ class GridUpdate(eqx.Module):
 class StageFriction(eqx.Module):
     """Friction at the end of a trapezoidal stage, so that the next stage begins from what sticks."""
 
-    held: ConstrainedNodes
-    """The nodes with the active set held."""
+    held: ConstrainedNodes  # the nodes with the active set held
 
     def __call__(self, method: AbstractImplicitIntegrator, v: NodeVector, u: NodeVector, share: Scalar) -> NodeVector:
         """The change of velocity [m/s], shape (n, d), in a stage of the length γΔt.

@@ -28,30 +28,19 @@ from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
 class Nodes(AbstractNodes):
     """The nodes at the start of a step, with the step and the boundaries: the input of an integrator."""
 
-    mass: NodeScalar
-    """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes (see `p2g`)."""
-    v: NodeVector
-    """`velocity`; where P2G has summed momentum and force together, v*."""
-    f: NodeVector | None
-    """`force`; None where P2G has summed momentum and force together."""
-    g: Any
-    """`acceleration`, an array; None likewise."""
-    dt: Float[Array, ""]
-    """Δt [s]."""
-    spacing: Float[Array, ""]
-    """dx [m]."""
-    potential: ElasticPotential
-    """Φ, a function of nodal displacements."""
-    conditions: Conditions
-    """The conditions that the boundaries prescribe."""
-    contacts: tuple[AbstractContact, ...] = ()
-    """The contacts of the scene; none of them is active here."""
+    mass: NodeScalar  # m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes (see `p2g`)
+    v: NodeVector  # `velocity`; where P2G has summed momentum and force together, v*
+    f: NodeVector | None  # `force`; None where P2G has summed momentum and force together
+    g: Any  # `acceleration`, an array; None likewise
+    dt: Float[Array, ""]  # Δt [s]
+    spacing: Float[Array, ""]  # dx [m]
+    potential: ElasticPotential  # Φ, a function of nodal displacements
+    conditions: Conditions  # the conditions that the boundaries prescribe
+    contacts: tuple[AbstractContact, ...] = ()  # the contacts of the scene; none of them is active here
     brought_by: tuple[int | None, ...] = eqx.field(static=True, default=())
     """The number of the boundary that brings each contact; None for that of two bodies."""
-    loose: "Nodes | None" = None
-    """The nodes before the constraints of bodies; None without any."""
-    tied: tuple[AbstractLayerImage, ...] = ()
-    """The maps of these constraints."""
+    loose: "Nodes | None" = None  # the nodes before the constraints of bodies; None without any
+    tied: tuple[AbstractLayerImage, ...] = ()  # the maps of these constraints
     friction: Callable[..., NodeVector] | None = None
     """The friction of contacts in an inner stage (see `StageFriction`); None without contacts."""
 
