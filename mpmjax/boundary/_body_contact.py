@@ -275,6 +275,8 @@ def series_stiffness(a: Array, b: Array, felt: Array | bool = True) -> Array:
 
 def _normal(a: Body, b: Body, felt: Bool[Array, "m"], grid: Grid) -> Float[Array, "d m"]:
     """The unit normal from the second body to the first, shape (d, m); any where one of them is not felt."""
+    # the bodies meet in a sheet, along which its places spread and across which they do not: C⁻¹ turns any direction
+    # between the bodies towards its normal, in which C is least
     thin = la.cofactor(_spread(a.part * b.part, grid))  # C⁻¹, times its determinant
     thin = thin / la.trace(thin)
     direction = (a.middle - b.middle)[:, None]

@@ -114,6 +114,7 @@ class Conditions(eqx.Module):
                 length=length,
                 speed=jnp.where(some, missing / length, 0),
             )
+            # as many places as directions, whichever colliders reach a node: few of many reach the same one
             for place, old in enumerate(parts):  # goes into the first place that is empty at each node
                 taken = old.owner >= 0
                 parts[place] = old.where(taken, new)

@@ -74,6 +74,7 @@ class StageFriction(eqx.Module):
 def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     """The grid update with contact: the active set is searched without derivatives, the last solve with it held is
     differentiated, and friction acts after that."""
+    # the search is iterations: reverse mode stores their result and never differentiates them
     active, guess, cost, sweeps = saved_for_backward(find_active_set(*without_derivative((nodes, method))))
     held, motion, solved, info = _solve_held(constrain(nodes, active), method, guess)
     elastic = None if nodes.f is None else method.elastic_impulse(nodes, motion)
@@ -96,11 +97,13 @@ def find_active_set(
         elastic = None if nodes.f is None else method.elastic_impulse(nodes, motion)
         residual = held.without_spring_impulses(reaction(nodes, solved, elastic))
         pulls, enters = held.violations(motion.velocity, residual)
+        # all places are exchanged at once (a primal-dual active set), so that the sweeps do not grow with their number
         active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
         return active, motion.carrier, cost.followed_by(info), count_places(nodes, pulls, enters) > 0, count + 1
 
     guess, zero, none = method.initial_guess(nodes), jnp.zeros((), nodes.mass.dtype), jnp.asarray(0, jnp.int32)
     start = method.mean_displacement(nodes, NodeMotion(guess))
+    # what nothing holds moves with v*: the gaps that this closes are the first guess
     predictor, nothing_held = nodes.explicit_velocity(), ConstrainedNodes(nodes, (), Mirror(()), nodes, start)
     active = tuple(contact.likely_held(nothing_held, predictor) for contact in nodes.contacts)
     cost = SolveInfo(residual=zero, report=zero)
@@ -119,6 +122,7 @@ def _solve_held(
     motion, info = method.advance(replace(held.nodes, friction=StageFriction(held)), guess)
     motion = solved = jax.tree.map(held.images.unfold, motion)
     if motion.friction is not None:
+        # the equations of the nodes, which say what walls hold, know nothing of an inner stage's friction
         solved = replace(motion, velocity=motion.velocity - motion.friction)
     return replace(held, displacement=method.mean_displacement(held.nodes, motion)), motion, solved, info
 

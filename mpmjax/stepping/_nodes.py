@@ -191,6 +191,7 @@ def particles_to_grid(
     if scene.body_force is not None:
         x = particles.x + body_force_at * dt * particles.v if body_force_at else particles.x
         body_force = components(scene.body_force.acceleration(x, t + body_force_at * dt if body_force_at else t))
+    # one sum costs half of two, and an explicit step asks for v* alone
     if joined:
         v = v + dt * (gravity[:, None] if body_force is None else gravity[:, None] + body_force)
     affine, impulse = C if scene.transfer.affine else None, -dt * flux if joined else None
@@ -233,6 +234,7 @@ def with_boundaries(
     conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)
     if scene.total and conditions.colliders is not None and conditions.colliders.slides:
         slid = reduce(jnp.logical_or, (slide.normal.any(axis=1) for slide in conditions.colliders.slides))
+        # where it slid the node is not where the collider took it for, and its torque acts where it is
         moved = places_of(particles, potential.stencil, grid.size)
         place = jnp.where(slid[:, None] & nodes.occupied, moved, conditions.colliders.position)
         conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
@@ -258,6 +260,7 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar
     images = mirror(scene.boundary, scene.grid, scene.window(particles), t, nodes.dt)
     bodies = [constraint.at_start(scene, particles, nodes, images) for constraint in scene.constraints]
     if bodies:
+        # all bodies in one fold: each fold divides by the mass, which would round the velocity of the others again
         loose, tied = nodes.folded(images) if images.images else nodes, tuple(image for image, *_ in bodies)
         nodes = loose.folded(Mirror(tied))
         layers = nodes.velocity, nodes.conditions.fixed, nodes.conditions.velocity
