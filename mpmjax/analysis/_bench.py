@@ -37,17 +37,13 @@ class Trial(NamedTuple):
     """A run by a method at a step and spacing, with its seconds and error."""
 
     method: AbstractIntegrator
-    refinement: int
-    """The spacing of the scene over that of the run."""
-    dt: float
-    """Δt [s]."""
+    refinement: int  # the spacing of the scene over that of the run
+    dt: float  # Δt [s]
     steps: int
     seconds: float
     """Wall time without compilation [s]: of one run, the faster of two brief ones, or foreseen from fewer steps."""
-    error: float
-    """Relative error of the motion; infinite if the run failed, NaN if it was foreseen to take too long."""
-    linearisation_error: float = 0.0
-    """Linearisation error of the steps [-] (`RunStatistics.linearisation_error`)."""
+    error: float  # relative error of the motion; infinite if the run failed, NaN if it was foreseen to take too long
+    linearisation_error: float = 0.0  # linearisation error of the steps [-] (`RunStatistics.linearisation_error`)
 
     def __str__(self) -> str:
         spacing = f", spacing / {self.refinement}" if self.refinement > 1 else ""

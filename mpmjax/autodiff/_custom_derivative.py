@@ -144,10 +144,8 @@ class _Call(NamedTuple):
 
     function: custom_derivative
     tree: Any
-    fixed: tuple[Hashable, ...]
-    """The leaves of the arguments, `_ARRAY` in the place of each array."""
-    types: tuple[type, ...]
-    """The types of these leaves: 1 and 1.0 are equal, but not the same program."""
+    fixed: tuple[Hashable, ...]  # the leaves of the arguments, `_ARRAY` in the place of each array
+    types: tuple[type, ...]  # the types of these leaves: 1 and 1.0 are equal, but not the same program
     params: tuple[tuple[str, Hashable], ...]
     mapped: tuple[tuple[int | None, ...], ...] = ()
     """The mapped axes of the arrays for each `jax.vmap` around the call, the inner one first. Results are mapped along
@@ -352,15 +350,11 @@ def _some_stored(changes: Sequence[Any]) -> list[Any]:
     return [None if a is None else next(stored) for a in changes]
 
 
-def _store_in_place(call: Callable[..., list[Array]], *arrays: Array) -> list[Array]:
-    return call(arrays, {}, aliases={i: i for i in range(len(arrays))})
-
-
 _stored = custom_derivative(
     lambda *arrays: list(arrays),
     kernel="stored",
     results=lambda *arrays: list(arrays),
-    call=_store_in_place,
+    call=lambda call, *arrays: call(arrays, {}, aliases={i: i for i in range(len(arrays))}),
     elementwise=True,
 )
 _stored.defjvp(lambda primals, tangents: (_stored(*primals), _some_stored(tangents)))

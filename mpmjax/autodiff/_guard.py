@@ -53,19 +53,14 @@ _guard_p = Primitive("guard")
 _guard_p.multiple_results = True
 
 
-def _say(faults: tuple[str, ...], failure: str, fault: Any, signal: Any) -> None:
-    """Raise the error of a fault or a signal whose numbers are known."""
-    if (worst := np.max(fault)) > 0:
-        raise RuntimeError(faults[int(worst) - 1])
-    if not np.all(np.asarray(signal) == 0):
-        raise RuntimeError(f"{failure} The relative residual was {np.max(np.abs(signal)):.2g}.")
-
-
 @_guard_p.def_impl
 def _evaluate(*operands: Any, faults: tuple[str, ...], failure: str, derivative: bool) -> list[Any]:
-    *leaves, signal, fault = operands
-    _say(faults, failure, fault, signal if derivative else np.zeros(()))
-    return [*leaves, signal]
+    """Raise at once, as the numbers are known."""
+    if (worst := np.max(operands[-1])) > 0:
+        raise RuntimeError(faults[int(worst) - 1])
+    if derivative and not np.all(np.asarray(signal := operands[-2]) == 0):
+        raise RuntimeError(f"{failure} The relative residual was {np.max(np.abs(signal)):.2g}.")
+    return list(operands[:-1])
 
 
 @_guard_p.def_abstract_eval
@@ -82,13 +77,13 @@ def _compiled(*operands: Any, faults: tuple[str, ...], failure: str, derivative:
     if derivative:
         index = jnp.where((index == 0) & (signal != 0).any(), len(faults) + 1, index)
     raised = eqx.branched_error_if(jnp.asarray(False), index > 0, index - 1, (*faults, failure))
-    return [*(jnp.where(raised, jnp.full_like(a, _unusable(a.dtype)), a) for a in leaves), signal]
 
+    def unusable(dtype: Any) -> Any:
+        if jnp.issubdtype(dtype, jnp.inexact):
+            return np.nan
+        return True if jnp.issubdtype(dtype, jnp.bool_) else jnp.iinfo(dtype).max
 
-def _unusable(dtype: Any) -> Any:
-    if jnp.issubdtype(dtype, jnp.inexact):
-        return np.nan
-    return True if jnp.issubdtype(dtype, jnp.bool_) else jnp.iinfo(dtype).max
+    return [*(jnp.where(raised, jnp.full_like(a, unusable(a.dtype)), a) for a in leaves), signal]
 
 
 register_lowering(_guard_p, lower_fun(_compiled, multiple_results=True))
@@ -116,11 +111,10 @@ def _guarded(changes: Any, fault: Any, **parameters: Any) -> list[Any]:
 primitive_jvps[_guard_p] = _differentiated
 
 
-def _transposed(cotangents: Any, *operands: Any, **parameters: Any) -> list[Any]:
-    return [*_guarded(cotangents, operands[-1], **parameters), None]
-
-
-primitive_transposes[_guard_p] = _transposed
+primitive_transposes[_guard_p] = lambda cotangents, *operands, **parameters: [
+    *_guarded(cotangents, operands[-1], **parameters),
+    None,
+]
 
 
 def _batched(operands: Any, axes: Any, **parameters: Any) -> tuple[list[Any], list[Any]]:

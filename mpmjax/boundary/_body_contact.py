@@ -63,18 +63,12 @@ class Body(NamedTuple):
     """A body as the nodes of its layer see it: sums over its particles with weights w_ip V_p, V_p being their present
     volume. Lengths are in spacings."""
 
-    part: Float[Array, "m"]
-    """Σ_p w_ip V_p / dx^d [-], shape (m,): about the part of the kernel that the body fills."""
-    middle: Float[Array, "d m"]
-    """The mean of x_p − x_i [-], shape (d, m)."""
-    side: Float[Array, "m"]
-    """The mean side of the particles, V_p^(1/d) [-], shape (m,)."""
-    velocity: Float[Array, "d m"]
-    """Their mean velocity [m/s], shape (d, m)."""
-    modulus: Float[Array, "m"]
-    """Their mean wave modulus at rest [Pa], shape (m,)."""
-    density: Float[Array, "m"]
-    """Their mean density [kg/m^d], shape (m,)."""
+    part: Float[Array, "m"]  # Σ_p w_ip V_p / dx^d [-], shape (m,): about the part of the kernel that the body fills
+    middle: Float[Array, "d m"]  # the mean of x_p − x_i [-], shape (d, m)
+    side: Float[Array, "m"]  # the mean side of the particles, V_p^(1/d) [-], shape (m,)
+    velocity: Float[Array, "d m"]  # their mean velocity [m/s], shape (d, m)
+    modulus: Float[Array, "m"]  # their mean wave modulus at rest [Pa], shape (m,)
+    density: Float[Array, "m"]  # their mean density [kg/m^d], shape (m,)
 
 
 class Patch(eqx.Module):
@@ -129,16 +123,11 @@ def moment(blocks: Array, axis: int, power: int, *, reach: int, periodic: bool) 
 class Coupling(AbstractSpring):
     """The springs between two bodies."""
 
-    stretch: Float[Array, "m"]
-    """g_i at u = 0 [m], shape (m,); zero where nothing is held."""
-    stiffness: Float[Array, "m"]
-    """k_i [N/m], shape (m,); zero where nothing is held."""
-    normal: Float[Array, "m d"]
-    """n_i [-], shape (m, d)."""
-    patch: Patch
-    """The nodes over which displacements are averaged, by c_a c_b/(c_a + c_b) of the two bodies."""
-    pair: tuple[int, int] = eqx.field(static=True)
-    """The numbers of the bodies a and b."""
+    stretch: Float[Array, "m"]  # g_i at u = 0 [m], shape (m,); zero where nothing is held
+    stiffness: Float[Array, "m"]  # k_i [N/m], shape (m,); zero where nothing is held
+    normal: Float[Array, "m d"]  # n_i [-], shape (m, d)
+    patch: Patch  # the nodes over which displacements are averaged, by c_a c_b/(c_a + c_b) of the two bodies
+    pair: tuple[int, int] = eqx.field(static=True)  # the numbers of the bodies a and b
 
     def elongation(self, moved: Displacement) -> Float[Array, "m"]:
         """n_i · Σ_j q_ij (u_j^a − u_j^b) [m], shape (m,)."""
@@ -179,19 +168,14 @@ class BodyContact(AbstractSpringContact):
     Friction is at most μ times the push at each node, against the slip of the two bodies.
     """
 
-    gap: Float[Array, "m"]
-    """g_i at the start of the step [m], shape (m,); infinite where a body is not felt."""
-    normal: Float[Array, "m d"]
-    """n_i [-], from the second body to the first, shape (m, d)."""
+    gap: Float[Array, "m"]  # g_i at the start of the step [m], shape (m,); infinite where a body is not felt
+    normal: Float[Array, "m d"]  # n_i [-], from the second body to the first, shape (m, d)
     stiffness: Float[Array, "m"]
-    coefficient: Scalar
-    """Coulomb coefficient [-]."""
+    coefficient: Scalar  # Coulomb coefficient [-]
     dt: Scalar
     share: Scalar
-    patch: Patch
-    """The nodes around each, by c_a c_b/(c_a + c_b) of the two bodies."""
-    pair: tuple[int, int] = eqx.field(static=True)
-    """The numbers of the bodies."""
+    patch: Patch  # the nodes around each, by c_a c_b/(c_a + c_b) of the two bodies
+    pair: tuple[int, int] = eqx.field(static=True)  # the numbers of the bodies
 
     @property
     def near(self) -> Bool[Array, "m"]:
@@ -291,6 +275,8 @@ def series_stiffness(a: Array, b: Array, felt: Array | bool = True) -> Array:
 
 def _normal(a: Body, b: Body, felt: Bool[Array, "m"], grid: Grid) -> Float[Array, "d m"]:
     """The unit normal from the second body to the first, shape (d, m); any where one of them is not felt."""
+    # the bodies meet in a sheet, along which its places spread and across which they do not: C⁻¹ turns any direction
+    # between the bodies towards its normal, in which C is least
     thin = la.cofactor(_spread(a.part * b.part, grid))  # C⁻¹, times its determinant
     thin = thin / la.trace(thin)
     direction = (a.middle - b.middle)[:, None]

@@ -17,8 +17,7 @@ PARALLEL = 1e-2
 class OwnedImpulse(eqx.Module):
     """Impulses on the nodes, and the boundaries or colliders that give them."""
 
-    impulse: NodeVector
-    """[kg m/s], shape (n, d)."""
+    impulse: NodeVector  # [kg m/s], shape (n, d)
     owner: Int[Array, "..."] | int
     """The number of the boundary or collider, −1 for none: of all nodes, or of shape (n, 1) or (n, d)."""
 
@@ -26,27 +25,20 @@ class OwnedImpulse(eqx.Module):
 class Slide(eqx.Module):
     """A collider that holds the nodes in it along its normal."""
 
-    normal: NodeVector
-    """Unit normal out of it, shape (n, d); zero at nodes that it does not hold."""
-    velocity: NodeVector
-    """Velocity of the collider at the nodes [m/s], shape (n, d)."""
-    number: int = eqx.field(static=True, default=0)
-    """Number of the collider among all colliders."""
+    normal: NodeVector  # unit normal out of it, shape (n, d); zero at nodes that it does not hold
+    velocity: NodeVector  # velocity of the collider at the nodes [m/s], shape (n, d)
+    number: int = eqx.field(static=True, default=0)  # number of the collider among all colliders
 
 
 class ColliderConditions(eqx.Module):
     """The conditions of k colliders on the nodes that lie in them."""
 
-    slides: tuple[Slide, ...]
-    """The colliders that hold nodes along their normal alone, in the scene's order."""
-    holder: Int[Array, "n d"]
-    """Number of the collider that prescribes each component, −1 for none, shape (n, d)."""
+    slides: tuple[Slide, ...]  # the colliders that hold nodes along their normal alone, in the scene's order
+    holder: Int[Array, "n d"]  # number of the collider that prescribes each component, −1 for none, shape (n, d)
     position: NodeVector
     """Where the nodes are [m], shape (n, d): in the total description those that are held have moved with the body."""
-    pivots: Float[Array, "k d"]
-    """The points about which the colliders' torques are taken [m], shape (k, d)."""
-    pivot_velocity: Float[Array, "k d"]
-    """Their velocity [m/s], shape (k, d)."""
+    pivots: Float[Array, "k d"]  # the points about which the colliders' torques are taken [m], shape (k, d)
+    pivot_velocity: Float[Array, "k d"]  # their velocity [m/s], shape (k, d)
 
     @property
     def touched(self) -> Bool[Array, "n"]:
@@ -74,16 +66,11 @@ class ColliderConditions(eqx.Module):
 class FreeNormal(eqx.Module):
     """A collider's normal at each node, and its part in free components at right angles to those of earlier ones."""
 
-    normal: NodeVector
-    """The collider's unit normal, shape (n, d)."""
-    owner: Int[Array, "n"]
-    """The collider's number, shape (n,); −1 where there is no such part."""
-    direction: NodeVector
-    """Unit vector along that part, shape (n, d); zero where there is none."""
-    length: NodeScalar
-    """Length of that part [-], shape (n,); 1 where there is none."""
-    speed: NodeScalar
-    """Velocity along it [m/s], shape (n,), at which the whole normal velocity is that of the collider."""
+    normal: NodeVector  # the collider's unit normal, shape (n, d)
+    owner: Int[Array, "n"]  # the collider's number, shape (n,); −1 where there is no such part
+    direction: NodeVector  # unit vector along that part, shape (n, d); zero where there is none
+    length: NodeScalar  # length of that part [-], shape (n,); 1 where there is none
+    speed: NodeScalar  # velocity along it [m/s], shape (n,), at which the whole normal velocity is that of the collider
 
     def where(self, mask: Bool[Array, "n"], other: "FreeNormal") -> "FreeNormal":
         """This one at nodes of the mask, the other one elsewhere."""
@@ -93,12 +80,9 @@ class FreeNormal(eqx.Module):
 class Conditions(eqx.Module):
     """The conditions of boundaries on the window's nodes."""
 
-    fixed: Mask
-    """Components of velocity that are prescribed, shape (n, d)."""
-    velocity: NodeVector
-    """Their values [m/s], shape (n, d); zero elsewhere."""
-    colliders: ColliderConditions | None = None
-    """Conditions of colliders; None without any."""
+    fixed: Mask  # components of velocity that are prescribed, shape (n, d)
+    velocity: NodeVector  # their values [m/s], shape (n, d); zero elsewhere
+    colliders: ColliderConditions | None = None  # conditions of colliders; None without any
     holds: bool = eqx.field(static=True, default=True)
     """Whether any component may be held. What is known here costs a step nothing where the answer is no."""
     moves: bool = eqx.field(static=True, default=True)
@@ -130,6 +114,7 @@ class Conditions(eqx.Module):
                 length=length,
                 speed=jnp.where(some, missing / length, 0),
             )
+            # as many places as directions, whichever colliders reach a node: few of many reach the same one
             for place, old in enumerate(parts):  # goes into the first place that is empty at each node
                 taken = old.owner >= 0
                 parts[place] = old.where(taken, new)

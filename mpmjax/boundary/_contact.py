@@ -311,6 +311,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     def violations(self, v: NodeVector, residual: NodeVector) -> tuple[ActiveSet, ActiveSet]:
         """The held places that pull, and the others that are entered, beyond rounding, at the velocity after the
         solve."""
+        # a place at rest is neither pulled nor entered: without a margin rounding would flip it in every sweep
         noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
         pulling, entering = [], []
         for contact, active in zip(self.unconstrained.contacts, self.active, strict=True):

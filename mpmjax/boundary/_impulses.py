@@ -33,8 +33,7 @@ class Impulses(eqx.Module):
     particles, and so all nodes.
     """
 
-    impulse: Float[Array, "*f k d"]
-    """Impulse [kg m/s], friction included."""
+    impulse: Float[Array, "*f k d"]  # impulse [kg m/s], friction included
     angular: Float[Array, "*f k r"]
     """Angular impulse [kg m²/s] about the `pivot` of the boundary as it moves, of a collider the centre of its rotation
     or, without one, its shape's middle: r = 1 component in 2-D, 3 in 3-D, none in 1-D. Nodes and pivot are taken where
@@ -55,10 +54,8 @@ def no_impulses(count: int, dim: int, dtype: Any) -> Impulses:
 class OwnedCouple(eqx.Module):
     """A couple on a constrained body, and the boundary that gives it."""
 
-    moment: Float[Array, "r"]
-    """[kg m²/s], shape (r,)."""
-    owner: Int[Array, ""]
-    """The number of the boundary, −1 for none."""
+    moment: Float[Array, "r"]  # [kg m²/s], shape (r,)
+    owner: Int[Array, ""]  # the number of the boundary, −1 for none
 
 
 def received_impulses(

@@ -20,8 +20,7 @@ class Level(NamedTuple):
     """Fronts that are not coupled with each other: numbers that are eliminated together, and those that feel it. Where
     fronts of a level differ in size, they are filled up with the number past the last."""
 
-    eliminated: np.ndarray
-    """The numbers that are eliminated, shape (fronts, s)."""
+    eliminated: np.ndarray  # the numbers that are eliminated, shape (fronts, s)
     border: np.ndarray
     """The numbers coupled with them and with what was eliminated before, and that come after, shape (fronts, b)."""
     places: np.ndarray | None
@@ -38,12 +37,9 @@ class Dissection(eqx.Module):
     The numbers of a node's materials stand together, node by node.
     """
 
-    shape: tuple[int, ...] = eqx.field(static=True)
-    """Number of nodes along each axis."""
-    reach: int = eqx.field(static=True)
-    """Largest distance of two nodes that are coupled, in spacings along an axis."""
-    materials: int = eqx.field(static=True, default=1)
-    """How many numbers a node has."""
+    shape: tuple[int, ...] = eqx.field(static=True)  # number of nodes along each axis
+    reach: int = eqx.field(static=True)  # largest distance of two nodes that are coupled, in spacings along an axis
+    materials: int = eqx.field(static=True, default=1)  # how many numbers a node has
 
     @property
     def size(self) -> int:
@@ -70,10 +66,8 @@ class DissectedFactor(eqx.Module):
     X and not F_oo⁻¹ is kept: the product with the latter loses as many digits again as F_oo has in its condition.
     """
 
-    inverse: tuple[Float[Array, "_ _ _"], ...]
-    """X of each level's fronts, shape (f, o, o)."""
-    below: tuple[Float[Array, "_ _ _"], ...]
-    """Y, shape (f, b, o)."""
+    inverse: tuple[Float[Array, "_ _ _"], ...]  # X of each level's fronts, shape (f, o, o)
+    below: tuple[Float[Array, "_ _ _"], ...]  # Y, shape (f, b, o)
     dissection: Dissection
 
     def solve(self, r: Float[Array, "m"]) -> Float[Array, "m"]:

@@ -73,10 +73,8 @@ class RigidImage(AbstractLayerImage):
 
     layer: int = eqx.field(static=True)
     layers: int = eqx.field(static=True)
-    arms: Float[Array, "m d"]
-    """r_i = x_i − c [m], shape (m, d)."""
-    per_root: Float[Array, "r r"]
-    """G⁻¹ [1/m]."""
+    arms: Float[Array, "m d"]  # r_i = x_i − c [m], shape (m, d)
+    per_root: Float[Array, "r r"]  # G⁻¹ [1/m]
 
     def spin(self, s: Float[Array, "d"]) -> Float[Array, "r"]:
         """ω [rad/s] from the velocity of the second node [m/s]."""

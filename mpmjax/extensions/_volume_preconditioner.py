@@ -113,12 +113,9 @@ class VolumePreconditioner(AbstractPreconditioner):
 class NodeBox(eqx.Module):
     """A box of nodes in a window, which may be anywhere in it."""
 
-    window: tuple[int, ...] = eqx.field(static=True)
-    """Number of the window's nodes along each axis."""
-    shape: tuple[int, ...] = eqx.field(static=True)
-    """Number of the box's nodes along each axis."""
-    corner: Int[Array, "d"]
-    """The box's first node along each axis."""
+    window: tuple[int, ...] = eqx.field(static=True)  # number of the window's nodes along each axis
+    shape: tuple[int, ...] = eqx.field(static=True)  # number of the box's nodes along each axis
+    corner: Int[Array, "d"]  # the box's first node along each axis
 
     def inside(self, field: Float[Array, "*a n"], spare: int = 0) -> Float[Array, "*a m"]:
         """A field of nodes (..., n) in the box and so many nodes around it, zero beyond the window."""
@@ -249,11 +246,9 @@ class _Divergence(eqx.Module):
 class VolumeInnerProduct(AbstractInnerProduct):
     """The inner product of W = P + Bᵀ C B (see `VolumePreconditioner`)."""
 
-    weight: NodeVector
-    """The diagonal of P [kg], shape (n, d)."""
+    weight: NodeVector  # the diagonal of P [kg], shape (n, d)
     divergence: _Divergence
-    softness: Float[Array, "a m"]
-    """1/C [m^2d/kg] of the box's nodes; infinite where B counts for nothing."""
+    softness: Float[Array, "a m"]  # 1/C [m^2d/kg] of the box's nodes; infinite where B counts for nothing
     factor: DissectedFactor
     box: NodeBox
     diagonal: DiagonalInnerProduct

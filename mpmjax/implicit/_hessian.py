@@ -38,16 +38,13 @@ class ParticleStiffness(AbstractHessianAction):
     derivative's direction first.
     """
 
-    upper: Float[Array, "t p"]
-    """The upper triangle of K_p, row by row, shape (d²(d² + 1)/2, p)."""
+    upper: Float[Array, "t p"]  # the upper triangle of K_p, row by row, shape (d²(d² + 1)/2, p)
     stencil: Stencil
     mirror: Mirror
     positive_semidefinite: bool = eqx.field(static=True, default=False)
     """Whether the K_p with `coupled` are known to be positive semi-definite."""
-    coupled: tuple[AbstractStiffness, ...] = ()
-    """The stiffness of materials that couples their particles."""
-    others: tuple[AbstractStiffness, ...] = ()
-    """The stiffness of terms."""
+    coupled: tuple[AbstractStiffness, ...] = ()  # the stiffness of materials that couples their particles
+    others: tuple[AbstractStiffness, ...] = ()  # the stiffness of terms
 
     def is_positive_semidefinite(self) -> bool:
         """Whether H is known to be positive semi-definite."""

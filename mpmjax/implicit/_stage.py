@@ -55,31 +55,19 @@ class StageProblem(eqx.Module):
     With `linearised`, f(u) is f(0) − H u and the equation (M + χ H) v = b with χ = θΔt_s² (eq. 17).
     """
 
-    mass: NodeScalar
-    """Nodal masses m_i [kg], shape (n,)."""
-    inertial: NodeVector
-    """a [m/s], the velocity of the stage without the force at its own end, shape (n, d)."""
-    stage_dt: Float[Array, ""]
-    """Δt_s [s], the length of the stage."""
-    initial_displacement: NodeVector | None
-    """u [m], shape (n, d); None for zero."""
-    force: NodeVector
-    """f(0) [N], shape (n, d); in a linearised problem f(0) − H u."""
-    spacing: Float[Array, ""]
-    """Grid spacing dx [m]."""
-    potential: ElasticPotential
-    """Φ, with f = −∂Φ/∂u."""
-    hessian: AbstractHessian
-    """H = ∂²Φ/∂u∂u [N/m], exactly or approximately."""
-    projection: Projection
-    """The projection on free components."""
-    prescribed: NodeVector | None
-    """The velocity of held components [m/s], shape (n, d); None if they are at rest."""
+    mass: NodeScalar  # nodal masses m_i [kg], shape (n,)
+    inertial: NodeVector  # a [m/s], the velocity of the stage without the force at its own end, shape (n, d)
+    stage_dt: Float[Array, ""]  # Δt_s [s], the length of the stage
+    initial_displacement: NodeVector | None  # u [m], shape (n, d); None for zero
+    force: NodeVector  # f(0) [N], shape (n, d); in a linearised problem f(0) − H u
+    spacing: Float[Array, ""]  # grid spacing dx [m]
+    potential: ElasticPotential  # Φ, with f = −∂Φ/∂u
+    hessian: AbstractHessian  # H = ∂²Φ/∂u∂u [N/m], exactly or approximately
+    projection: Projection  # the projection on free components
+    prescribed: NodeVector | None  # the velocity of held components [m/s], shape (n, d); None if they are at rest
     preconditioner: AbstractPreconditioner
-    theta: Scalar = 1.0
-    """θ [-], the share of the stage's displacement at which its force is evaluated."""
-    action: AbstractHessianAction | None = None
-    """H at the start of the step in a linearised problem; None in others."""
+    theta: Scalar = 1.0  # θ [-], the share of the stage's displacement at which its force is evaluated
+    action: AbstractHessianAction | None = None  # H at the start of the step in a linearised problem; None in others
 
     def operator(self, v: NodeVector, hessian: AbstractHessian | None = None) -> ImplicitOperator:
         """M + θΔt_s D + θΔt_s² H at v, the derivative of `residual`.
@@ -192,8 +180,7 @@ class Reporting(eqx.Module):
     """
 
     solver: lx.AbstractLinearSolver
-    slot: Scalar
-    """Zero."""
+    slot: Scalar  # zero
 
 
 @custom_derivative

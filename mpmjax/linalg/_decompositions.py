@@ -58,6 +58,7 @@ def _jacobi(S: Matrix) -> tuple[Array, Matrix]:
         A, V = map(entries, state)
         for p, q in pairs(d):
             gap, twice = A[q][q] - A[p][p], 2 * A[p][q]
+            # the smaller of the two angles, below 45 degrees, with which sweeps converge; its quotient cancels nowhere
             scale = jnp.abs(gap) + jnp.hypot(gap, twice)
             tan = jnp.where(gap < 0, -twice, twice) / jnp.where(scale == 0, 1, scale)
             cos = 1 / jnp.sqrt(1 + tan * tan)
@@ -192,6 +193,7 @@ def _largest_root(F: Matrix) -> Array:
         square = root * root - 1
         slope = 4 * root * square - 8 * J
         lower = root - (square * square - 8 * J * root - 4 * cof2) / jnp.where(slope == 0, 1, slope)
+        # where rounding would raise it, it has converged
         return jnp.where(lower < root, lower, root)
 
     return jax.lax.fori_loop(0, _NEWTON_STEPS, step, jnp.full_like(J, jnp.sqrt(3.0).astype(F.dtype)))
@@ -209,6 +211,7 @@ def _dominant_quaternion(F: Matrix, root: Array) -> list[Array]:
         minor = [[K[r][c] for c in columns] for r in rows]
         return (-1) ** (i + j) * dot(minor[0], cofactors(minor)[0])
 
+    # every column is a multiple of the eigenvector: the one of the largest entry is not made of rounding
     upper = {(i, j): signed_minor(i, j) for i in range(4) for j in range(i, 4)}
     columns = [[upper[min(i, j), max(i, j)] for i in range(4)] for j in range(4)]
     best, size = columns[0], jnp.abs(columns[0][0])

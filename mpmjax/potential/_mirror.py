@@ -28,12 +28,9 @@ from mpmjax.potential._wall_image import WallImage
 class MirrorPlace(NamedTuple):
     """The place of a boundary's mirror."""
 
-    axis: int
-    """The direction of its normal."""
-    position: Scalar
-    """Coordinate on the lattice of nodes [m]."""
-    motion: Motion | None
-    """How it moves; None if it rests."""
+    axis: int  # the direction of its normal
+    position: Scalar  # coordinate on the lattice of nodes [m]
+    motion: Motion | None  # how it moves; None if it rests
 
 
 @custom_derivative
@@ -78,16 +75,12 @@ class AbstractImage(eqx.Module):
 class Image(AbstractImage):
     """Signed copies of true nodes at their mirror images, along one axis of the window."""
 
-    shape: tuple[int, ...] = eqx.field(static=True)
-    """The grid's shape, of each of its layers."""
+    shape: tuple[int, ...] = eqx.field(static=True)  # the grid's shape, of each of its layers
     layers: int = eqx.field(static=True)
     axis: int = eqx.field(static=True)
-    source: Int[Array, "m"]
-    """The node of which each node along the axis is a copy, shape (m,)."""
-    even: Int[Array, "m"]
-    """The sign of copies of even fields, 0 where the source is outside of the window, shape (m,)."""
-    odd: Int[Array, "m"]
-    """The sign of copies of odd fields, 0 on the plane too, shape (m,)."""
+    source: Int[Array, "m"]  # the node of which each node along the axis is a copy, shape (m,)
+    even: Int[Array, "m"]  # the sign of copies of even fields, 0 where the source is outside of the window, shape (m,)
+    odd: Int[Array, "m"]  # the sign of copies of odd fields, 0 on the plane too, shape (m,)
     velocity: Scalar | None = None
     """Velocity V of a mirror that moves along its normal [m/s]; None at rest. The normal velocity of a node beyond it
     is 2V minus that of its image, and V on it."""
@@ -143,8 +136,7 @@ class Image(AbstractImage):
 class Scaling(AbstractImage):
     """A factor of each component of velocity, by which nodes that walls tie to others have one mass for all of them."""
 
-    factor: NodeVector
-    """Shape (n, d) [-]."""
+    factor: NodeVector  # shape (n, d) [-]
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
         return field
@@ -174,8 +166,7 @@ def transposed(linear: Callable[[Array], Array], field: Array) -> Array:
 class Tie(AbstractImage):
     """One velocity for several nodes, that of the first: the map B of a rigid part."""
 
-    tied: Bool[Array, "n"]
-    """The nodes tied together."""
+    tied: Bool[Array, "n"]  # the nodes tied together
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
         return jnp.where(self.tied, field[jnp.argmax(self.tied)], field)

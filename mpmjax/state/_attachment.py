@@ -145,6 +145,7 @@ class Patch(AbstractPlace):
         particle = _nearest(x, middle, apart, self)
         axis = np.abs(area).argmax(axis=1)
         facing = 2 * axis + (np.take_along_axis(area, axis[:, None], axis=1)[:, 0] > 0)
+        # a corner has pieces of several faces on one particle, whose normals a single point would average
         one, piece = np.unique(np.stack([particle, facing]), axis=1, return_inverse=True)
         summed = np.zeros((one.shape[1], 1 + 2 * self.dim))
         np.add.at(summed, piece.reshape(-1), np.column_stack([weight, weight[:, None] * middle, area]))

@@ -136,6 +136,7 @@ class AveragedDeformation(eqx.Module):
     ) -> "AveragedDifferential":
         """The derivative of `stress`, from P̄ and the law's stress differential at F̄. If `definite`, without the
         terms of P̄: the map is then positive semi-definite if the law's differential is."""
+        # without stress the second variation is that of δF̄ alone, by a positive semi-definite map
         P = jnp.zeros_like(P) if definite else P
         tau = la.double_dot(P, self.averaged)
         return AveragedDifferential(self, P, tau, self.pull(tau), la.cofactor(self.F), tangent)
@@ -291,6 +292,7 @@ class MaterialPoints(eqx.Module):
         """V0 P Fᵀ [J], a stress P weighted with the volume, shape (d, d, q), whose sum is the force,
         f_i = −Σ_p (V0 P Fᵀ) g_ip: the transpose of `change`. In the total description V0 P; by P = dΨ/dJ it is
         V0 P J I."""
+        # stored once: XLA would else evaluate the law again in each component of the product
         P = materialised(self.volume * P)
         return P if self.total else self.law.measure.kirchhoff_stress(P, self.deformation, dim)
 

@@ -23,16 +23,13 @@ class GridUpdate(eqx.Module):
     """The motion of the nodes over a step, mirrored at active contact planes."""
 
     motion: NodeMotion
-    solved: NodeMotion
-    """`motion` before friction."""
+    solved: NodeMotion  # `motion` before friction
     elastic: NodeVector | None
     """The impulse of elastic forces (see `AbstractIntegrator.elastic_impulse`) [kg m/s], shape (n, d); None if P2G
     summed momentum and force together."""
     solve: SolveInfo
-    constrained: ConstrainedNodes | None = None
-    """The nodes with the active set held; None in a scene without contact."""
-    friction: tuple[NodeVector, ...] = ()
-    """The change of velocity by the friction of each contact [m/s], shape (n, d)."""
+    constrained: ConstrainedNodes | None = None  # the nodes with the active set held; None in a scene without contact
+    friction: tuple[NodeVector, ...] = ()  # the change of velocity by the friction of each contact [m/s], shape (n, d)
     contact: ContactInfo | None = None
 
     def held(self, nodes: Nodes) -> ConstrainedNodes:
@@ -49,8 +46,7 @@ class GridUpdate(eqx.Module):
 class StageFriction(eqx.Module):
     """Friction at the end of a trapezoidal stage, so that the next stage begins from what sticks."""
 
-    held: ConstrainedNodes
-    """The nodes with the active set held."""
+    held: ConstrainedNodes  # the nodes with the active set held
 
     def __call__(self, method: AbstractImplicitIntegrator, v: NodeVector, u: NodeVector, share: Scalar) -> NodeVector:
         """The change of velocity [m/s], shape (n, d), in a stage of the length γΔt.
@@ -79,14 +75,13 @@ class StageFriction(eqx.Module):
 def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     """The grid update with contact: the active set is searched without derivatives, the last solve with it held is
     differentiated, and friction acts after that."""
+    # the search is iterations: reverse mode stores their result and never differentiates them
     active, guess, cost, sweeps = saved_for_backward(find_active_set(*without_derivative((nodes, method))))
-    held, motion, solved, info = _solve_held(constrain(nodes, active), method, guess)
-    elastic = None if nodes.f is None else method.elastic_impulse(nodes, motion)
-    holding = held.without_spring_impulses(reaction(nodes, solved, elastic))
-    velocity, friction = held.friction(solved.velocity, holding)
-    contact = ContactInfo(sweeps, count_places(nodes, *held.violations(solved.velocity, holding)))
-    motion = method.with_friction(motion, velocity - motion.velocity)
-    return GridUpdate(motion, solved, elastic, cost.followed_by(info), held, friction, contact)
+    held, new, holding = _solve_held(constrain(nodes, active), method, guess)
+    velocity, friction = held.friction(new.solved.velocity, holding)
+    contact = ContactInfo(sweeps, count_places(nodes, *held.violations(new.solved.velocity, holding)))
+    motion = method.with_friction(new.motion, velocity - new.motion.velocity)
+    return replace(new, motion=motion, solve=cost.followed_by(new.solve), friction=friction, contact=contact)
 
 
 def find_active_set(
@@ -97,15 +92,21 @@ def find_active_set(
 
     def sweep(state: tuple) -> tuple:
         active, guess, cost, _, count = state
-        held, motion, solved, info = _solve_held(constrain(nodes, active), method, guess)
-        elastic = None if nodes.f is None else method.elastic_impulse(nodes, motion)
-        residual = held.without_spring_impulses(reaction(nodes, solved, elastic))
-        pulls, enters = held.violations(motion.velocity, residual)
+        held, new, holding = _solve_held(constrain(nodes, active), method, guess)
+        pulls, enters = held.violations(new.motion.velocity, holding)
+        # all places are exchanged at once (a primal-dual active set), so that the sweeps do not grow with their number
         active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
-        return active, motion.carrier, cost.followed_by(info), count_places(nodes, pulls, enters) > 0, count + 1
+        return (
+            active,
+            new.motion.carrier,
+            cost.followed_by(new.solve),
+            count_places(nodes, pulls, enters) > 0,
+            count + 1,
+        )
 
     guess, zero, none = method.initial_guess(nodes), jnp.zeros((), nodes.mass.dtype), jnp.asarray(0, jnp.int32)
     start = method.mean_displacement(nodes, NodeMotion(guess))
+    # what nothing holds moves with v*: the gaps that this closes are the first guess
     predictor, nothing_held = nodes.explicit_velocity(), ConstrainedNodes(nodes, (), Mirror(()), nodes, start)
     active = tuple(contact.likely_held(nothing_held, predictor) for contact in nodes.contacts)
     cost = SolveInfo(residual=zero, report=zero)
@@ -119,13 +120,19 @@ def find_active_set(
 
 def _solve_held(
     held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
-) -> tuple[ConstrainedNodes, NodeMotion, NodeMotion, SolveInfo]:
-    """The nodes with their displacement, their motion, that before friction, and the report of the solve."""
+) -> tuple[ConstrainedNodes, GridUpdate, NodeVector]:
+    """The nodes with their displacement, their update before friction at the end, and the impulse that holds components
+    of velocity [kg m/s], shape (n, d)."""
+    nodes = held.unconstrained
     motion, info = method.advance(replace(held.nodes, friction=StageFriction(held)), guess)
     motion = solved = jax.tree.map(held.images.unfold, motion)
     if motion.friction is not None:
+        # the equations of the nodes, which say what walls hold, know nothing of an inner stage's friction
         solved = replace(motion, velocity=motion.velocity - motion.friction)
-    return replace(held, displacement=method.mean_displacement(held.nodes, motion)), motion, solved, info
+    held = replace(held, displacement=method.mean_displacement(held.nodes, motion))
+    elastic = None if nodes.f is None else method.elastic_impulse(nodes, motion)
+    holding = held.without_spring_impulses(reaction(nodes, solved, elastic))
+    return held, GridUpdate(motion, solved, elastic, info, held), holding
 
 
 def reaction(nodes: Nodes, motion: NodeMotion, elastic: NodeVector | None) -> NodeVector:

@@ -326,6 +326,7 @@ class TRBDF2(AbstractImplicitIntegrator):
         dt, g, v0 = nodes.dt, nodes.acceleration, nodes.admitted_velocity()
         length = q2 * dt  # Δt_s = ½γΔt
         viscous = nodes.potential.viscous
+        # G_0 is that of the start: no force is evaluated for it
         pull = nodes.per_mass(nodes.force - nodes.potential.viscous_resistance(v0) if viscous else nodes.force)
         inertial = v0 + length * (pull + 2 * g)
         middle, first = self.solve_stage(nodes, guess, inertial, length, length * v0)

@@ -28,30 +28,19 @@ from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
 class Nodes(AbstractNodes):
     """The nodes at the start of a step, with the step and the boundaries: the input of an integrator."""
 
-    mass: NodeScalar
-    """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes (see `p2g`)."""
-    v: NodeVector
-    """`velocity`; where P2G has summed momentum and force together, v*."""
-    f: NodeVector | None
-    """`force`; None where P2G has summed momentum and force together."""
-    g: Any
-    """`acceleration`, an array; None likewise."""
-    dt: Float[Array, ""]
-    """Δt [s]."""
-    spacing: Float[Array, ""]
-    """dx [m]."""
-    potential: ElasticPotential
-    """Φ, a function of nodal displacements."""
-    conditions: Conditions
-    """The conditions that the boundaries prescribe."""
-    contacts: tuple[AbstractContact, ...] = ()
-    """The contacts of the scene; none of them is active here."""
+    mass: NodeScalar  # m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes (see `p2g`)
+    v: NodeVector  # `velocity`; where P2G has summed momentum and force together, v*
+    f: NodeVector | None  # `force`; None where P2G has summed momentum and force together
+    g: Any  # `acceleration`, an array; None likewise
+    dt: Float[Array, ""]  # Δt [s]
+    spacing: Float[Array, ""]  # dx [m]
+    potential: ElasticPotential  # Φ, a function of nodal displacements
+    conditions: Conditions  # the conditions that the boundaries prescribe
+    contacts: tuple[AbstractContact, ...] = ()  # the contacts of the scene; none of them is active here
     brought_by: tuple[int | None, ...] = eqx.field(static=True, default=())
     """The number of the boundary that brings each contact; None for that of two bodies."""
-    loose: "Nodes | None" = None
-    """The nodes before the constraints of bodies; None without any."""
-    tied: tuple[AbstractLayerImage, ...] = ()
-    """The maps of these constraints."""
+    loose: "Nodes | None" = None  # the nodes before the constraints of bodies; None without any
+    tied: tuple[AbstractLayerImage, ...] = ()  # the maps of these constraints
     friction: Callable[..., NodeVector] | None = None
     """The friction of contacts in an inner stage (see `StageFriction`); None without contacts."""
 
@@ -202,6 +191,7 @@ def particles_to_grid(
     if scene.body_force is not None:
         x = particles.x + body_force_at * dt * particles.v if body_force_at else particles.x
         body_force = components(scene.body_force.acceleration(x, t + body_force_at * dt if body_force_at else t))
+    # one sum costs half of two, and an explicit step asks for v* alone
     if joined:
         v = v + dt * (gravity[:, None] if body_force is None else gravity[:, None] + body_force)
     affine, impulse = C if scene.transfer.affine else None, -dt * flux if joined else None
@@ -244,6 +234,7 @@ def with_boundaries(
     conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)
     if scene.total and conditions.colliders is not None and conditions.colliders.slides:
         slid = reduce(jnp.logical_or, (slide.normal.any(axis=1) for slide in conditions.colliders.slides))
+        # where it slid the node is not where the collider took it for, and its torque acts where it is
         moved = places_of(particles, potential.stencil, grid.size)
         place = jnp.where(slid[:, None] & nodes.occupied, moved, conditions.colliders.position)
         conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
@@ -269,6 +260,7 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar
     images = mirror(scene.boundary, scene.grid, scene.window(particles), t, nodes.dt)
     bodies = [constraint.at_start(scene, particles, nodes, images) for constraint in scene.constraints]
     if bodies:
+        # all bodies in one fold: each fold divides by the mass, which would round the velocity of the others again
         loose, tied = nodes.folded(images) if images.images else nodes, tuple(image for image, *_ in bodies)
         nodes = loose.folded(Mirror(tied))
         layers = nodes.velocity, nodes.conditions.fixed, nodes.conditions.velocity

@@ -181,6 +181,7 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator, t: Sc
         at_rest = ConstrainedNodes(nodes, (), Mirror(()), nodes)
         contacts = [contact for contact in nodes.contacts if contact.known_at_start(nodes)]
         springs = (contact.springs(contact.likely_held(at_rest, nodes.velocity)) for contact in contacts)
+        # springs that are shut already push at the start, and what they accelerate strains the particles
         terms = tuple(spring for spring in springs if spring is not None)
         pushed = nodes.constrained(Mirror(()), nodes.mass, nodes.conditions.fixed, terms)
         a = pushed.projection.combine(pushed.per_mass(pushed.force) + pushed.acceleration, 0.0)
