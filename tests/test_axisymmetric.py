@@ -8,12 +8,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, FLUIDS, LAWS, METHODS, PLASTIC, SECOND_ORDER, VISCOUS, assert_close, ids, thorough
+from helpers import (
+    DESCRIPTIONS,
+    FLUIDS,
+    LAWS,
+    METHODS,
+    PLASTIC,
+    SECOND_ORDER,
+    TRANSFERS,
+    VISCOUS,
+    assert_close,
+    ids,
+    thorough,
+)
+from jax.flatten_util import ravel_pytree
 
 import mpmjax as mpm
 from mpmjax.checks import canonical
 from mpmjax.implicit import AnalyticHessian
-from mpmjax.stepping import start_nodes
+from mpmjax.state import state_of, with_state
+from mpmjax.stepping import start_nodes, step_unchecked
 
 GRID = mpm.Grid((10, 12), 0.1, origin=(-3, -3), axisymmetric=True)
 EVERY = LAWS | PLASTIC | FLUIDS | VISCOUS
@@ -222,3 +236,30 @@ def test_files_and_scene_files_know_it(tmp_path):
     assert again.scene.grid.axisymmetric
     mpm.render(run, tmp_path / "run.png")
     assert (tmp_path / "run.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize("description", ["updated", *thorough("total")])
+@pytest.mark.parametrize("transfer", ["apic", *thorough("pic", "flip")])
+def test_the_longest_step_is_stable_at_any_radius(description, transfer):
+    """Of a ring alone on the grid the map of a step, by its Jacobian, has no eigenvalue beyond the unit circle at the
+    bound, from the axis on; at twice the bound it has, so that the bound costs less than half the step."""
+    scene = mpm.Scene(GRID, LAWS["neo_hookean"], transfer=TRANSFERS[transfer], description=DESCRIPTIONS[description])
+    scene, one = canonical(scene, jnp.float64), jnp.ones(1)
+    ring = mpm.prepare(scene, mpm.Particles(jnp.array([[0.05, 0.23]]), jnp.zeros((1, 2)), one, 1e-3 * one))
+
+    @eqx.filter_jit
+    def largest(r, factor):
+        at = eqx.tree_at(lambda q: q.x, ring, ring.x.at[0, 0].set(r))
+        at = at if at.X is None else eqx.tree_at(lambda q: q.X, at, at.x)
+        dt = factor * mpm.stable_dt(scene, at, safety=1.0)
+        flat, back = ravel_pytree(state_of(at))
+
+        def step(flat):
+            end, _ = step_unchecked(scene, with_state(at, back(flat)), 0.0, dt, mpm.Explicit())
+            return ravel_pytree(state_of(end))[0]
+
+        return jnp.abs(jnp.linalg.eigvals(jax.jacfwd(step)(flat))).max()
+
+    for r in (0.002, 0.025, 0.049, 0.051, 0.075, 0.14, 0.26):
+        assert float(largest(r, 0.999)) < 1 + 1e-6, r
+        assert float(largest(r, 2.0)) > 1.1, r
