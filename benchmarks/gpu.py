@@ -101,8 +101,8 @@ def apart(ours: tuple, theirs: tuple) -> float:
 def outcomes(quick: bool) -> dict[str, tuple]:
     """State and gradient of each case in both precisions, compiled by several threads."""
     of = {
-        f"{name}, {dtype}": outcome(*case, dtype)
-        for name, *case in cases()
+        f"{name}, {dtype}": outcome(d, law, choices, method, factor, dtype)
+        for name, d, law, choices, method, factor in cases()
         if not quick or name == "2-D"
         for dtype in TOLERANCES
     }

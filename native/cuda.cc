@@ -164,8 +164,10 @@ std::string compiled(const std::string& kernel, const std::string& card, std::st
   if (folder.empty() || code.empty()) return code;
   // Another process sees the whole file or none.
   const std::string begun = path + "." + std::to_string(getpid());
-  std::ofstream(begun, std::ios::binary).write(code.data(), static_cast<std::streamsize>(code.size()));
-  if (std::rename(begun.c_str(), path.c_str()) != 0) std::remove(begun.c_str());
+  std::ofstream file(begun, std::ios::binary);
+  file.write(code.data(), static_cast<std::streamsize>(code.size()));
+  file.close();
+  if (!file || std::rename(begun.c_str(), path.c_str()) != 0) std::remove(begun.c_str());
   return code;
 }
 
@@ -191,10 +193,21 @@ Handle function_of(Handle context, const std::string& text, std::string& fault) 
   return place->second;
 }
 
-// XLA's stream.
+// XLA's stream, whose context is current as long as this lives.
 struct Stream {
-  Handle handle;
+  Handle handle, context = nullptr;
   mutable std::string fault;
+
+  explicit Stream(Handle stream) : handle(stream) {
+    fault = driver().fault(driver().context_of(handle, &context), "finding the context of a stream");
+    if (fault.empty()) fault = driver().fault(driver().push(context), "entering the context of a stream");
+    if (!fault.empty()) context = nullptr;
+  }
+  Stream(const Stream&) = delete;
+  ~Stream() {
+    Handle left = nullptr;
+    if (context != nullptr) driver().pop(&left);
+  }
 
   template <class T>
   void clear(T* numbers, int64_t count) const {
@@ -211,26 +224,19 @@ struct Stream {
     const Basis<T>& basis = all.stencils.basis;
     std::string types = sizeof(T) == sizeof(float) ? "float" : "double";
     for (const int n : {basis.d, basis.s, columns}) types += ", " + std::to_string(n);
-    Handle context = nullptr;
-    fault = driver().fault(driver().context_of(handle, &context), "finding the context of a stream");
-    if (!fault.empty()) return;
-    driver().push(context);
     const Handle function = function_of(context, text_of(problem, kernel, types, basis.terms), fault);
-    if (fault.empty()) {
-      void* arguments[] = {const_cast<Problem<T>*>(&all), &count, &batch};
-      const auto blocks = static_cast<unsigned>((count + kThreads - 1) / kThreads);
-      const auto members = static_cast<unsigned>(std::min(batch, kMostMembers));
-      const int code =
-          driver().launch(function, blocks, members, 1, kThreads, 1, 1, 0, handle, arguments, nullptr);
-      fault = driver().fault(code, kernel);
-    }
-    driver().pop(&context);
+    if (!fault.empty()) return;
+    void* arguments[] = {const_cast<Problem<T>*>(&all), &count, &batch};
+    const auto blocks = static_cast<unsigned>((count + kThreads - 1) / kThreads);
+    const auto members = static_cast<unsigned>(std::min(batch, kMostMembers));
+    const int code = driver().launch(function, blocks, members, 1, kThreads, 1, 1, 0, handle, arguments, nullptr);
+    fault = driver().fault(code, kernel);
   }
 };
 
 template <auto for_floats, auto for_doubles>
 ffi::Error run(Handle stream, ffi::Dictionary attributes, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
-  const Stream on = {stream, ""};
+  const Stream on(stream);
   const ffi::Error error = run_on<for_floats, for_doubles, 2, 1>(on, attributes, arguments, results);
   return error.success() && !on.fault.empty() ? ffi::Error::Internal("mpmjax's CUDA sums: " + on.fault) : error;
 }

@@ -3,6 +3,7 @@
 import ctypes
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -162,6 +163,57 @@ def test_nvrtc_compiles_the_kernels(card, types, tmp_path):
     assert len(list(tmp_path.glob("*.cubin"))) == len(kernels)
     broken = [text.encode() for text in (NVRTC[0], str(tmp_path), "Scatter", "nothing", types)]
     assert "nothing" in library.mpmjax_compile(*broken, 3, card.encode()).decode()
+
+
+STAND_INS = """
+#include <cstring>
+extern "C" {
+#define RETURNS(name) int name(...) { return 0; }
+RETURNS(cuInit) RETURNS(cuDeviceGet) RETURNS(cuCtxPushCurrent_v2) RETURNS(cuCtxPopCurrent_v2) RETURNS(cuStreamGetCtx)
+RETURNS(cuCtxGetDevice) RETURNS(cuModuleGetFunction) RETURNS(cuMemsetD32Async) RETURNS(cuLaunchKernel)
+RETURNS(cuGetErrorName) RETURNS(cuDevicePrimaryCtxRetain)
+RETURNS(nvrtcVersion) RETURNS(nvrtcCreateProgram) RETURNS(nvrtcDestroyProgram)
+RETURNS(nvrtcGetProgramLogSize) RETURNS(nvrtcGetProgramLog)
+int cuDeviceGetCount(int* count) { return *count = CARDS, 0; }
+int cuDeviceGetAttribute(int* value, int attribute, int) { return *value = attribute == 75 ? 9 : 0, 0; }
+int cuModuleLoadData(void**, const void* code) { return std::strcmp(static_cast<const char*>(code), "code for sm_90"); }
+const char* target;
+int nvrtcCompileProgram(void*, int, const char** options) { return target = std::strchr(options[0], '=') + 1, 0; }
+int nvrtcGetCUBINSize(void*, size_t* size) { return *size = 15, 0; }
+int nvrtcGetCUBIN(void*, char* code) { return std::strcpy(code, "code for "), std::strcat(code, target), 0; }
+}
+"""
+PROGRAM = """
+import jax, mpmjax as mpm
+from helpers import block
+from mpmjax.native import _backend
+print(_backend.Cuda.absence())
+scene, particles = block(2)
+run = jax.jit(lambda q: mpm.rollout(scene, q, steps=1, dt=1e-3).x)
+text = run.trace(mpm.prepare(scene, particles)).lower(lowering_platforms=("cuda",)).as_text()
+print("mpmjax_average" in text or "mpmjax_scatter" in text, "mpmjax_gather" in text)
+"""
+
+
+@NEEDS_COMPILER
+@pytest.mark.skipif(not _library.CUDA_PATH.is_file(), reason="the library for cards was not built")
+@pytest.mark.parametrize(
+    ("cards", "lines"), [(1, ["", "True True"]), *thorough((0, ["the driver has no card", "False False"]))]
+)
+def test_where_there_is_a_driver_programs_for_cards_call_the_kernels(cards, lines, tmp_path):
+    """By stand-ins for the driver and NVRTC, which say what a card of capability 9.0 would."""
+    source = tmp_path / "stand_ins.cc"
+    source.write_text(STAND_INS)
+    command = ["c++", "-shared", "-fPIC", f"-DCARDS={cards}", str(source), "-o"]
+    for name in ("libcuda.so.1", "libnvrtc.so.13"):
+        subprocess.run([*command, str(tmp_path / name)], check=True)
+    path = f"{NATIVE.parent}{os.pathsep}{NATIVE.parent / 'tests'}"
+    variables = {"LD_LIBRARY_PATH": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": path}
+    environment = os.environ | variables | {"MPMJAX_BACKEND": "cuda" if cards else "", "JAX_PLATFORMS": "cpu"}
+    out = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True)
+    assert out.stdout.splitlines() == lines
+    kept = [file.read_bytes() for file in (tmp_path / "mpmjax").glob("*.cubin")]
+    assert (b"code for sm_90\0" in kept) == bool(cards)
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="there may be a card")
