@@ -72,7 +72,7 @@ def cases() -> Iterator[tuple[str, int, Any, dict[str, Any], Any, float]]:
 
 def outcome(d: int, law: Any, choices: dict, method: Any, factor: float, dtype: str) -> Callable[[], tuple]:
     """State and gradient of a small block after some steps."""
-    b = block(d, 216 if d == 3 else 36, 16, 2**d, dtype)
+    b = block(d, (12, 36, 216)[d - 1], 16, 2**d, dtype)
     scene = mpm.Scene(mpm.Grid((b.nodes,) * d, b.spacing), law, gravity=(*[0.0] * (d - 1), -9.81), **choices)
 
     def run() -> tuple:
