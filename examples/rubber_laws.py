@@ -34,7 +34,7 @@ def measured(kind, upto):
 
 
 # %%
-def experiment(law, kind, stretch, stress):
+def experiment(law, kind, stretch, stress, sigma=None):
     """The test as a simulation, with what was measured."""
     d, pulled = KINDS[kind]
     grid = mpm.Grid((4,) * d, EDGE, origin=(-1,) * d)
@@ -55,7 +55,7 @@ def experiment(law, kind, stretch, stress):
         description=mpm.TotalLagrangian(),
     )
     gauge = mpm.fitting.StressStretch.of(mpm.Box((0.0,) * d, (EDGE,) * d), particles, axis=1)
-    seen = mpm.Curve(stretch, stress, gauge, name=f"{kind}, nominal stress [Pa]", x_name="stretch")
+    seen = mpm.Curve(stretch, stress, gauge, sigma=sigma, name=f"{kind}, nominal stress [Pa]", x_name="stretch")
     run = {"t1": float(len(stretch)), "dt": 1.0, "method": mpm.BackwardEuler()}
     return mpm.Experiment(scene, particles, **run, observations=seen, name=kind)
 

@@ -41,7 +41,7 @@ class LevenbergMarquardt(AbstractOptimiser):
     """
 
     rtol: Scalar = 1e-6
-    max_steps: int = eqx.field(static=True, default=50)
+    max_steps: int = eqx.field(static=True, default=300)
     mode: Literal["forward", "reverse"] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):

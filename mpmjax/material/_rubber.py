@@ -246,8 +246,9 @@ class Ogden(AbstractRubber):
 
     Ψ = Σ_k μ_k/α_k (λ̄_1^α_k + λ̄_2^α_k + λ̄_3^α_k − 3) + K/4 (J² − 1 − 2 ln J), μ = ½ Σ_k μ_k α_k.
 
-    *When it breaks*: it needs J > 0. It is stable at every stretch if each μ_k α_k is positive. Two exponents of one
-    sign are nearly the same to data of one kind of test: fit several kinds together. Each particle needs an eigenvalue
+    *When it breaks*: it needs J > 0. It is stable at every stretch if each μ_k α_k is positive, which is Drucker's
+    condition of each term: fit by `with_shear_moduli`. Two exponents of one sign are nearly the same to data of one
+    kind of test: fit several kinds together. Each particle needs an eigenvalue
     problem; where the exponents are 2 and −2, `MooneyRivlin` is the same law without.
     *Good values*: two or three terms, one exponent 1 to 2, one 4 to 6 for the upturn, one negative near −2 for what
     uniaxial and biaxial tests tell apart; K as for `MooneyRivlin`.
@@ -284,6 +285,28 @@ class Ogden(AbstractRubber):
     def shear_modulus(self) -> Scalar:
         """μ = ½ Σ_k μ_k α_k [Pa]."""
         return sum(modulus * exponent for modulus, exponent in zip(self.moduli, self.exponents, strict=True)) / 2
+
+    def with_shear_moduli(self, shear_moduli: tuple[Scalar, ...]) -> "Ogden":
+        """The law of these exponents whose terms have given shear moduli, μ_k = 2 c_k/α_k.
+
+        Positive ones make each term, and so the law, stable at every stretch, by construction, and make better
+        parameters of a fit than μ_k: c_k stays finite where an exponent goes to zero, and the first slope of the stress
+        does not change with α_k. The exponents come first:
+
+            "alpha": mpm.Positive(lambda e: e.scene.material.exponents[0]),
+            "c": mpm.Positive(update=lambda e, c: eqx.tree_at(
+                lambda e: e.scene.material, e, e.scene.material.with_shear_moduli(tuple(c))), start=(3e5,)),
+
+        Args:
+            shear_moduli: c_k [Pa], one a term.
+        """
+        terms = len(self.exponents)
+        require(
+            len(shear_moduli) == terms,
+            f"with_shear_moduli takes one shear modulus for each of its {terms} terms, got {len(shear_moduli)}.",
+        )
+        moduli = tuple(2 * c / a for c, a in zip(shear_moduli, self.exponents, strict=True))
+        return eqx.tree_at(lambda law: law.moduli, self, moduli)
 
     def powers(self) -> tuple[Scalar, ...]:
         return self.exponents
