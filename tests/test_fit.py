@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 import mpmjax as mpm
+from mpmjax.fitting import _evaluation
+from mpmjax.fitting._evaluation import Kept, costs_at, evaluated, parts_kept
 from mpmjax.fitting._observation import between
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._result import Estimate, NoiseEstimate
-from mpmjax.fitting._search import iterate, search, search_many
+from mpmjax.fitting._search import iterate_alone, jacobian, search, search_many
 from mpmjax.fitting._sequence import _extrapolate, _missed
 
 DT, STEPS, NOISE = 4e-3, 15, 1e-4
@@ -640,6 +642,37 @@ def test_fits_with_new_data_do_not_compile_anew():
     times, x, which = tracks()
     seen = mpm.Tracks(times, x, which=which, sigma=NOISE)
     mpm.fit(experiment(seen), {"E": STIFFNESS})
-    known = iterate._cached._cache_size()
+    known = iterate_alone._cached._cache_size()
     mpm.fit(experiment(eqx.tree_at(lambda o: o.data, seen, x + 1e-5)), {"E": STIFFNESS})
-    assert iterate._cached._cache_size() == known
+    assert iterate_alone._cached._cache_size() == known
+
+
+def test_a_new_observation_leaves_the_program_of_the_run_as_it_is():
+    """Another function, and other parameters, of one scene; the numbers are those of observations that are a part of
+    the run's program, as where memory has no room for states."""
+    times, x, _ = tracks()
+    of = {"E": STIFFNESS}
+
+    def problem(function, memory=2**28):
+        return FitProblem(experiment(mpm.Series(times, x[:, 0], function, sigma=NOISE)), of, memory)
+
+    def first(scene, particles):
+        return particles.x[0]
+
+    z, sigmas, points = jnp.zeros(1), (jnp.asarray(NOISE),), np.linspace(-0.1, 0.1, 3)[:, None]
+    kept = parts_kept(problem(first), 2)
+    assert kept == (Kept((True, False, False, False)),)  # of x, v, C and F
+    at, squares = evaluated(problem(first), z, z, sigmas, kept), costs_at(problem(first), points, sigmas, 3)
+    compiled = [program._cached._cache_size() for program in (_evaluation._run, _evaluation._runs)]
+    scarce = problem(first, 1)
+    r, J = jacobian(scarce, z, sigmas)
+    assert parts_kept(scarce, 1) is None
+    np.testing.assert_allclose(at.r, r, rtol=1e-9, atol=1e-9 * np.abs(r).max())
+    np.testing.assert_allclose(at.J, J, rtol=1e-9, atol=1e-9 * np.abs(J).max())
+    np.testing.assert_allclose(squares, costs_at(scarce, points, sigmas, 3), rtol=1e-9)
+    assert squares[1] == pytest.approx((r**2).sum() / 2)
+    of["E"] = eqx.tree_at(lambda p: p.where, STIFFNESS, lambda e: e.scene.material.youngs_modulus)
+    third = problem(lambda scene, particles: particles.x[3] - particles.x[0])
+    assert np.abs(evaluated(third, z, z, sigmas, kept).r - at.r).max() > 1
+    costs_at(third, points, sigmas, 3)
+    assert compiled == [program._cached._cache_size() for program in (_evaluation._run, _evaluation._runs)]

@@ -18,7 +18,7 @@ from scipy.stats import norm, t
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._result import fit_result
-from mpmjax.fitting._search import Search, iterate, search_many
+from mpmjax.fitting._search import Search, iterate_alone, search_many
 from mpmjax.fitting._uncertainty import _mean_square, noise, seen_together, uncertainty
 from mpmjax.viz import draw_fit, write_fit
 
@@ -98,9 +98,9 @@ def test_profiles_of_a_linear_problem_are_students_intervals_in_any_coordinate(f
 def test_the_profiles_of_a_fit_are_one_program(fall):
     _, result = fall
     mpm.fitting.profile(result, "g", points=1)
-    known = iterate._cached._cache_size()
+    known = iterate_alone._cached._cache_size()
     mpm.fitting.profile(result, "v", points=1, level=0.8)
-    assert iterate._cached._cache_size() == known
+    assert iterate_alone._cached._cache_size() == known
 
 
 def test_the_band_of_a_linear_problem_is_students(fall):

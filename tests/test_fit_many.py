@@ -11,7 +11,7 @@ from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 import mpmjax as mpm
 from mpmjax.fitting._fit import MOST_COLUMNS, chosen_optimiser
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._search import NO_DERIVATIVE, iterate, search
+from mpmjax.fitting._search import NO_DERIVATIVE, iterate_alone, search
 
 SIGMAS = (jnp.asarray(NOISE),)
 BANDS = mpm.Positive(
@@ -166,10 +166,10 @@ def test_what_has_no_influence_is_refused_without_a_jacobian():
 def test_fits_by_lbfgs_with_new_data_do_not_compile_anew():
     of = seen()
     mpm.fit(experiment(of), {"E": STIFFNESS}, optimiser=mpm.fitting.LBFGS())
-    known = iterate._cached._cache_size()
+    known = iterate_alone._cached._cache_size()
     again = mpm.fitting.LBFGS(rtol=2e-3)
     mpm.fit(experiment(eqx.tree_at(lambda o: o.data, of, of.data + 1e-5)), {"E": STIFFNESS}, optimiser=again)
-    assert iterate._cached._cache_size() == known
+    assert iterate_alone._cached._cache_size() == known
 
 
 def test_the_rule_weighs_parameters_and_numbers():

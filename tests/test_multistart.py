@@ -10,9 +10,10 @@ import pytest
 from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
+from mpmjax.fitting._evaluation import costs_at
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import search, search_many
-from mpmjax.fitting._starts import costs_at, critical_distance, linked, starting_points, unit_points
+from mpmjax.fitting._starts import critical_distance, linked, starting_points, unit_points
 
 LM, Starts = mpm.fitting.LevenbergMarquardt(), mpm.fitting.Starts
 TIMES = np.linspace(0.001, 0.05, 40)

@@ -143,6 +143,10 @@ class AbstractObservation(eqx.Module):
             r = drawn_nearer(r, jnp.asarray(self.robust, dtype))
         return jnp.sqrt(weight) * r
 
+    def residuals_of(self, seen: Any, run: Run, sigma: Scalar | Array) -> Array:
+        """The residuals of a run of which it has seen the states; NaN where the run met a fault."""
+        return jnp.where(run.statistics.healthy, self.residuals(self.predict(seen, run), sigma), jnp.nan)
+
 
 def drawn_nearer(r: Array, limit: Scalar | Array) -> Array:
     """Residuals whose squares grow but linearly beyond a limit δ: r √(2/(1 + √(1 + r²/δ²))), half the square of which

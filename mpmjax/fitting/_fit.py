@@ -115,7 +115,7 @@ def fit(
     with recorded(problem, optimiser, progress, None if log is None else Path(log), resume=resume) as (past, record):
         first, earlier, sigmas, state = (0, (), problem.first_sigmas, None) if past is None else past
 
-        def begun(noise: Sigmas, number: int, seen: Evaluation) -> None:
+        def begun(noise: Sigmas, seen: Evaluation) -> None:
             """Name what the data do not see, or not apart, by the first Jacobian."""
             require_influence(problem, noise, seen)
             if seen.jacobian is not None and not paired:
@@ -125,23 +125,7 @@ def fit(
                     warn(f"At the first guess, {text}")
                     say(f"at the first guess, {text}")
 
-        def descend(z: Coordinates, noise: Sigmas, rounds: int = 0) -> tuple[Search, Noise | None, bool, Sigmas]:
-            """The minimum near z, the noise that it leaves, whether that still changes it, and the noise it was by."""
-
-            def minimise(_: int, starts: dict[int, Coordinates], noises: list[Sigmas]) -> dict[int, Search]:
-                nonlocal state
-                resumed, state = state, None
-                return search_many(
-                    [(problem, noises[0])],
-                    optimiser,
-                    starts,
-                    state=resumed,
-                    begun=partial(begun, noises[0]),
-                    report=partial(record, noises[0]),
-                )
-
-            noises = [noise]
-            return *_in_rounds([problem], noises, minimise, {0: z}, rounds)[0], noises[0]
+        descend = partial(_in_rounds, [problem], optimiser=optimiser, begun=begun, report=record)
 
         def resulted(end: Search, settled: Noise) -> FitResult:
             return fit_result(problem, optimiser, end, settled, report, level)
@@ -152,7 +136,7 @@ def fit(
                 return False
             return not resulted(end, settle_noise(problem, end, noise)[0]).is_beyond
 
-        end, settled, changing, noise = descend(zeros, sigmas, first)
+        ((end, settled, changing, noise),) = descend([sigmas], starts={0: zeros}, rounds=first, state=state)
         result = None if settled is None else resulted(end, settled)
         history = (*earlier, *end.history)
         # The log of a fit that other starts have brought farther holds a search that begins where none ended.
@@ -163,7 +147,7 @@ def fit(
             say(f"looking at other starts, {starts.count + len(starts.points)} points")
             best, screening = look_around(problem, optimiser, starts, end, noise, enough, progress)
             if best is not None:
-                end, settled, changing, _ = descend(best.z, problem.first_sigmas)
+                ((end, settled, changing, _),) = descend([problem.first_sigmas], starts={0: best.z})
                 result = None if settled is None else resulted(end, settled)
                 history = (*history, *end.history)
     if result is None:
@@ -202,25 +186,28 @@ def checked_level(level: Scalar) -> float:
 def _in_rounds(
     problems: list[FitProblem],
     sigmas: list[Sigmas],
-    minimise: Callable[[int, dict[int, Coordinates], list[Sigmas]], dict[int, Search]],
+    *,
+    optimiser: AbstractOptimiser,
     starts: dict[int, Coordinates],
     rounds: int = 0,
-) -> list[tuple[Search, Noise | None, bool]]:
+    state: Search | None = None,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> list[tuple[Search, Noise | None, bool, Sigmas]]:
     """Searches of each problem, again and again until the noise that it leaves is the noise that it was made with: the
-    last one, with all iterations; the noise, None where it failed; and whether that still changes the minimum.
-    `sigmas` are left as those of the last searches.
-
-    `minimise` makes searches, given the number of the round, the starts by the numbers of problems, and all noise.
-    """
+    last one, with all iterations; the noise, None where it failed; whether that still changes the minimum; and the
+    noise that it was made with. `state` and `options` as of `search_many`, after so many `rounds`."""
     histories: list[tuple[Iteration, ...]] = [()] * len(problems)
-    outcomes: dict[int, tuple[Search, Noise | None, bool]] = {}
+    outcomes: dict[int, tuple[Search, Noise | None, bool, Sigmas]] = {}
     while starts:
-        ends = minimise(rounds, starts, sigmas)
-        rounds, starts = rounds + 1, {}
+        told = counted(progress, f"round {rounds + 1}: {{}} of {{}} fits are done")
+        each = list(zip(problems, sigmas, strict=True))
+        ends = search_many(each, optimiser, starts, state=state, progress=told, **options)
+        rounds, starts, state = rounds + 1, {}, None
         for k, end in ends.items():
             histories[k] += end.history
             settled, changing = (None, False) if end.failure else settle_noise(problems[k], end, sigmas[k])
-            outcomes[k] = end._replace(history=histories[k]), settled, changing
+            outcomes[k] = end._replace(history=histories[k]), settled, changing, sigmas[k]
             if settled is not None and changing and end.converged and rounds < MOST_ROUNDS:
                 starts[k], sigmas[k] = end.z, tuple(sigma for sigma, *_ in settled)
     return [outcomes[k] for k in range(len(problems))]
@@ -243,6 +230,7 @@ def require_influence(problem: FitProblem, sigmas: Sigmas, seen: Evaluation) -> 
         # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.
         size = np.abs(np.asarray(seen.gradient)) / max(np.sqrt(2 * float(seen.cost)), np.finfo(float).tiny)
         if (size <= rounding).any():
+            # Jᵀw with random numbers w of variance one: the expected square of a component is that of J's column.
             size = np.abs(np.asarray(_random_pull(problem, jnp.zeros(problem.size, problem.dtype), sigmas)))
     else:
         size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
@@ -257,8 +245,7 @@ def require_influence(problem: FitProblem, sigmas: Sigmas, seen: Evaluation) -> 
 
 @eqx.filter_jit
 def _random_pull(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Coordinates:
-    """Jᵀw with random numbers w of variance one, by one pass of reverse mode: the expected square of a component is
-    that of the length of J's column."""
+    """Jᵀw with random numbers w of variance one, by one pass of reverse mode."""
     r, pull, _ = jax.vjp(lambda z: problem.residuals(z, sigmas, None), z, has_aux=True)
     return pull(jax.random.normal(jax.random.key(0), r.shape, r.dtype))[0]
 
@@ -372,16 +359,12 @@ def fit_ensemble(
     problems = [FitProblem(each, parameters) for each in sets]
     optimiser = chosen_optimiser(problems[0]) if optimiser is None else optimiser
     size = batch_size(problems[0], batch, len(problems))
-
-    def minimise(number: int, starts: dict[int, Coordinates], sigmas: list[Sigmas]) -> dict[int, Search]:
-        told = counted(progress, f"round {number + 1}: {{}} of {{}} fits are done")
-        return search_many(list(zip(problems, sigmas, strict=True)), optimiser, starts, batch=size, progress=told)
-
     zeros = {k: jnp.zeros(p.size, p.dtype) for k, p in enumerate(problems)}
-    outcomes = _in_rounds(problems, [p.first_sigmas for p in problems], minimise, zeros)
+    noise = [p.first_sigmas for p in problems]
+    outcomes = _in_rounds(problems, noise, optimiser=optimiser, starts=zeros, progress=progress, batch=size)
     fits = [
         None if settled is None else fit_result(problem, optimiser, end, settled, dict(report or {}), level)
-        for problem, (end, settled, _) in zip(problems, outcomes, strict=True)
+        for problem, (end, settled, *_) in zip(problems, outcomes, strict=True)
     ]
     failures = {k: end.failure for k, (end, *_) in enumerate(outcomes) if end.failure}
     if len(failures) == len(fits):

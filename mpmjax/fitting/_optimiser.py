@@ -14,6 +14,7 @@ import optimistix
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import as_floats, require_fields, require_positive, require_tolerance, require_whole
+from mpmjax.fitting._evaluation import Evaluated, parts_kept
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._search import AbstractOptimiser, Evaluation
 
@@ -50,12 +51,18 @@ class LevenbergMarquardt(AbstractOptimiser):
         require_whole("LevenbergMarquardt's max_steps", self.max_steps, 1)
 
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Any:
-        args = problem, sigmas, self.mode
-        shape, _ = jax.eval_shape(lambda z: _residuals(z, args), z)
-        return self._solver.init(_residuals, z, args, {}, shape, None, frozenset())
+        if parts_kept(problem, 1 + problem.size) is not None:
+            rows = problem.measured + len(jax.eval_shape(problem.prior_residuals, z.astype(problem.dtype)))
+        else:
+            rows = len(jax.eval_shape(lambda z: problem.jacobian(z.astype(problem.dtype), sigmas, self.mode), z)[0])
+        return _begun(self._solver, z, rows)
+
+    def place(self, problem: FitProblem, state: Any) -> Coordinates | None:
+        mode = problem.cheaper_mode if self.mode is None else self.mode
+        return state.y_eval if mode == "forward" else None
 
     def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: Any
+        self, problem: FitProblem | Evaluated, z: Coordinates, sigmas: Sigmas, state: Any
     ) -> tuple[Coordinates, Any, Evaluation]:
         z, state, _ = self._solver.step(_residuals, z, (problem, sigmas, self.mode), {}, state, frozenset())
         r, J = state.f_info.residual, state.f_info.jac.as_matrix()
@@ -72,7 +79,7 @@ class LevenbergMarquardt(AbstractOptimiser):
         side = np.where(down < up, 1, -1)
         straight = side * np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1))
         wanted = np.where(near, straight, step)
-        if not (near & (np.abs(np.asarray(state.y_eval - z, float)) < np.abs(wanted) / 2)).any():
+        if not (near & (np.abs(np.asarray(state.y_eval) - np.asarray(z)) < np.abs(wanted) / 2)).any():
             return state
         # The factor is what a refusal takes off the length of steps: damped ones go on as if it had not been tried.
         return eqx.tree_at(
@@ -123,6 +130,14 @@ class LevenbergMarquardt(AbstractOptimiser):
         return eqx.tree_at(lambda s: s.search, solver, _TrustRegion())
 
 
+@eqx.filter_jit
+def _begun(solver: Any, z: Coordinates, rows: int) -> Any:
+    """The state before the first iteration, of so many residuals."""
+    r, J, rooms = (jnp.zeros(shape, z.dtype) for shape in ((rows,), (rows, len(z)), (2, 2, len(z))))
+    shape = jax.eval_shape(lambda: r)
+    return solver.init(_residuals, z, (Evaluated(z, r, J, rooms), (), None), {}, shape, None, frozenset())
+
+
 class _TrustRegion(optimistix.ClassicalTrustRegion):
     """A trust region that takes no step uphill, though its quadratic foretells one: near a bound that is of
     coordinates, and the step of values."""
@@ -148,7 +163,7 @@ def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     return r, J, step / length, (step <= -down) | (step >= up)
 
 
-def _residuals(z: Coordinates, args: tuple[FitProblem, Sigmas, Any]) -> tuple[Array, None]:
+def _residuals(z: Coordinates, args: tuple[FitProblem | Evaluated, Sigmas, Any]) -> tuple[Array, None]:
     """The residuals, as optimistix asks for them."""
     problem, sigmas, mode = args
 
@@ -236,7 +251,9 @@ class LBFGS(AbstractOptimiser):
         value_fn = evaluated_once(evaluate)
         step, at_end = line.update(-along, line.init(z), z, value=cost, grad=gradient, value_fn=value_fn)
         moved = (at_end.learning_rate > 0) & (at_end.value <= cost + slack)
-        decrease_tolerance = jnp.maximum(jnp.asarray(self.rtol, z.dtype) ** 2 * problem.mean_square(cost), slack)
+        points = sum((jnp.isfinite(o.data).sum() for o in problem.observations), jnp.zeros((), int))
+        freedom = jnp.maximum(points + problem.fixed_by_priors - problem.size, 1).astype(cost.dtype)
+        decrease_tolerance = jnp.maximum(jnp.asarray(self.rtol, z.dtype) ** 2 * (2 * cost / freedom), slack)
         small = moved & (predicted_decrease <= decrease_tolerance) & (cost - at_end.value <= decrease_tolerance)
         after = LBFGSState(
             begun=state.begun,

@@ -64,8 +64,8 @@ class FitProblem(eqx.Module):
         require(len(numbers) > 0, f"The parameter {name!r} is of no experiment: only must name one at least.")
         experiment = self.experiments[numbers[0]]
         try:
-            start = parameter.first_guess(experiment)
-            changed = parameter.put(experiment, start + 1 + jnp.abs(start))
+            start = np.asarray(parameter.first_guess(experiment))
+            changed = parameter.put(experiment, jnp.asarray(1 + start + np.abs(start), start.dtype))
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise ValueError(
                 f"The parameter {name!r} must name a number of the experiment e, such as "
@@ -78,12 +78,12 @@ class FitProblem(eqx.Module):
             if eqx.is_array_like(a)
         )
         require(not same, f"The parameter {name!r} changes nothing of the experiment: name a number that it has.")
-        parameter.check(name, np.asarray(start))
+        parameter.check(name, start)
         if parameter.prior is not None:
             parameter.prior.check(name, start.shape)
         for k in numbers:
             parameter.check_experiment(name, self.experiments[k])
-        return start
+        return jnp.asarray(start)
 
     @property
     def size(self) -> int:
@@ -140,6 +140,7 @@ class FitProblem(eqx.Module):
         """Whether each coordinate is the logarithm of its value."""
         return tuple(parameter.logarithmic for parameter in self.owners)
 
+    @eqx.filter_jit
     def size_of_data(self, sigmas: Sigmas) -> Array:
         """√Σ (data/σ)², the size of what the residuals are the difference of [-]."""
         each = zip(self.observations, sigmas, strict=True)
@@ -150,11 +151,6 @@ class FitProblem(eqx.Module):
         """The part of ½ Σ r² that may be rounding: each residual has that of the data's size, ε √Σ (data/σ)² [-]."""
         noise = float(jnp.finfo(self.dtype).eps) * self.size_of_data(sigmas).astype(cost.dtype)
         return jnp.sqrt(2 * cost) * noise + noise**2 + float(jnp.finfo(cost.dtype).eps) * cost
-
-    def mean_square(self, cost: Array) -> Array:
-        """Σ r²/(m − n) of m numbers, those of priors among them, and n coordinates."""
-        points = sum((jnp.isfinite(o.data).sum() for o in self.observations), jnp.zeros((), int))
-        return 2 * cost / jnp.maximum(points + self.fixed_by_priors - self.size, 1).astype(cost.dtype)
 
     def misfit(self, cost: float) -> float:
         """Root mean square of the residuals of the measured numbers, in units of σ, or of the size of the data."""
@@ -171,15 +167,13 @@ class FitProblem(eqx.Module):
         ends = np.cumsum([0, *(o.data.size for o in self.observations)])
         return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(ends))
 
-    def coordinates(self, z: Coordinates) -> tuple[Array, ...]:
-        """The coordinates of each parameter, in its shape."""
-        parts = jnp.split(z, np.cumsum([start.size for start in self.starts])[:-1])
-        return tuple(part.reshape(start.shape) for part, start in zip(parts, self.starts, strict=True))
+    def unrestricted(self, z: Float[Array, "f"]) -> Float[Array, "n"]:
+        """The coordinates of all parameters, one after the other."""
+        return z
 
     def values(self, z: Coordinates) -> tuple[Array, ...]:
         """The value of each parameter."""
-        each = zip(self.parameters, self.starts, self.coordinates(z), strict=True)
-        return tuple(parameter.value(start, part) for parameter, start, part in each)
+        return _valued(self.parameters, self.starts, self.unrestricted(z))[0]
 
     def by_name(self, z: Coordinates) -> dict[str, np.ndarray]:
         """The value of each parameter by its name, in its shape."""
@@ -187,7 +181,7 @@ class FitProblem(eqx.Module):
 
     def numbers(self, z: Coordinates) -> Float[Array, "n"]:
         """The values of all parameters, one after the other."""
-        return jnp.concatenate([value.reshape(-1) for value in self.values(z)])
+        return _valued(self.parameters, self.starts, self.unrestricted(z))[1]
 
     def shown(self, z: np.ndarray | Coordinates) -> str:
         """The first values with their labels, in a line."""
@@ -197,9 +191,7 @@ class FitProblem(eqx.Module):
 
     def room(self, z: Coordinates) -> Float[Array, "2 n"]:
         """How far each value can fall and rise until its bounds, over its derivative by the coordinate [-]."""
-        each = zip(self.parameters, self.starts, self.coordinates(z), strict=True)
-        down, up = zip(*(parameter.room(start, part) for parameter, start, part in each), strict=True)
-        return jnp.stack([jnp.concatenate([a.reshape(-1) for a in side]) for side in (down, up)])
+        return _valued(self.parameters, self.starts, self.unrestricted(z))[2]
 
     def at(self, z: Coordinates) -> tuple[Experiment, ...]:
         """The experiments with these values."""
@@ -226,9 +218,8 @@ class FitProblem(eqx.Module):
         parts, reports, noise = [], [], iter(sigmas)
         for experiment in self.at(z):
             run = experiment.run(adjoint=adjoint, throw=False, checkpoint_bytes=self.memory)
-            for observation, predicted in zip(experiment.observations, experiment.predictions(run), strict=True):
-                r = observation.residuals(predicted, next(noise))
-                parts.append(jnp.where(run.statistics.healthy, r, jnp.nan))
+            each = zip(experiment.observations, run.observed, strict=True)
+            parts += [observation.residuals_of(seen, run, next(noise)) for observation, seen in each]
             assert run.report is not None
             reports.append(run.report)
         return jnp.concatenate([*parts, self.prior_residuals(z)]), jnp.stack(reports)
@@ -271,7 +262,7 @@ class FitProblem(eqx.Module):
         if (self.cheaper_mode if mode is None else mode) == "reverse":
             r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
             units = jnp.eye(self.measured, len(r), dtype=r.dtype)  # priors need no simulation
-            _, (rows,) = _in_batches(lambda unit: ((), pull(unit)), units, self.at_once)
+            _, (rows,) = in_batches(lambda unit: ((), pull(unit)), units, self.at_once)
             return r, jnp.concatenate([rows, jax.jacfwd(self.prior_residuals)(z)])
 
         evaluate = partial(self.residuals, sigmas=sigmas, adjoint=diffrax.ForwardMode())
@@ -286,43 +277,63 @@ class FitProblem(eqx.Module):
     @property
     def at_once(self) -> int:
         """How many tangents, or rows, of all experiments fit into the memory."""
-
-        def size(tree: Any) -> int:
-            """Size of all arrays, or of shapes that stand for them [B]."""
-            leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
-            return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)
-
         each = 0
         for e in self.experiments:
             seen = jax.eval_shape(eqx.Partial(observe_all, e.observations), e.scene, e.particles)
-            each += _COPIES * size(e.particles) + size(seen) * (e.steps + 1)
+            each += _COPIES * size_of(e.particles) + size_of(seen) * (e.steps + 1)
         return max(1, int(self.memory // max(each, 1)))
+
+
+@eqx.filter_jit
+def _valued(
+    parameters: tuple[AbstractParameter, ...], starts: tuple[Array, ...], z: Coordinates
+) -> tuple[tuple[Array, ...], Float[Array, "n"], Float[Array, "2 n"]]:
+    """The value of each parameter; the same one after the other; and their room: one program, which knows no scene."""
+    parts = jnp.split(z, np.cumsum([start.size for start in starts])[:-1])
+    each = [
+        (p, start, part.reshape(start.shape).astype(start.dtype))
+        for p, start, part in zip(parameters, starts, parts, strict=True)
+    ]
+    values = tuple(p.value(start, part) for p, start, part in each)
+    down, up = zip(*(p.room(start, part) for p, start, part in each), strict=True)
+    flat, *room = (jnp.concatenate([a.reshape(-1) for a in side]) for side in (values, down, up))
+    return values, flat, jnp.stack(room)
+
+
+def size_of(tree: Any) -> int:
+    """Size of all arrays, or of shapes that stand for them [B]."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
+    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)
 
 
 def linearised(function: Callable[[Coordinates], Any], z: Coordinates, at_once: int) -> tuple[Any, Any]:
     """The value of a function, and its derivative by each coordinate, with a leading axis n: by forward mode, so many
     tangents at once."""
     units = jnp.eye(len(z), dtype=z.dtype)
-    return _in_batches(lambda tangent: jax.jvp(function, (z,), (tangent,)), units, at_once)
+    return in_batches(lambda tangent: jax.jvp(function, (z,), (tangent,)), units, at_once)
 
 
-def _in_batches(function: Callable[[Array], tuple[Any, Any]], units: Array, at_once: int) -> tuple[Any, Any]:
-    """A function of each row of `units`, shape (k, ...), by batches of `at_once` rows. It returns two pytrees: one
-    that is the same for all rows, and one of each row, which gets a leading axis k."""
-    count = len(units)
+def in_batches(function: Callable[[Any], tuple[Any, Any]], units: Any, at_once: int) -> tuple[Any, Any]:
+    """A function of each row of arrays `units`, shapes (k, ...), by batches of `at_once` rows. It returns two pytrees:
+    one that is the same for all rows, and one of each row, which gets a leading axis k."""
+    count = len(jax.tree.leaves(units)[0])
     batches = -(-count // at_once)
     size = -(-count // batches)
 
-    def batch(rows: Array) -> tuple[Any, Any]:
+    def batch(rows: Any) -> tuple[Any, Any]:
         if size > 1:
             return jax.vmap(function, out_axes=(None, 0))(rows)
-        once, each = function(rows[0])  # a third less to compile than a batch of one
+        once, each = function(jax.tree.map(lambda a: a[0], rows))  # a third less to compile than a batch of one
         return once, jax.tree.map(lambda a: a[None], each)
 
     if batches == 1:
         return batch(units)
-    padded = jnp.concatenate([units, jnp.zeros((batches * size - count, *units.shape[1:]), units.dtype)])
-    once, each = jax.lax.map(batch, padded.reshape(batches, size, *units.shape[1:]))
+
+    def split(a: Array) -> Array:
+        padded = jnp.concatenate([a, jnp.zeros((batches * size - count, *a.shape[1:]), a.dtype)])
+        return padded.reshape(batches, size, *a.shape[1:])
+
+    once, each = jax.lax.map(batch, jax.tree.map(split, units))
     return jax.tree.map(lambda a: a[0], once), jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], each)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
+from mpmjax.fitting._evaluation import costs_at
 from mpmjax.fitting._fit import checked_level
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._result import FitResult, intervals
@@ -130,7 +131,7 @@ def profile(
 
     def misfit(z: np.ndarray) -> float:
         """Σ r²."""
-        return float((np.asarray(_residuals(problem, jnp.asarray(z, dtype), sigmas), float) ** 2).sum())
+        return 2 * float(costs_at(problem, z[None], sigmas, 1)[0])
 
     start: _Point = np.asarray(result.z, float), 0.0
     least, visited, unsettled, texts = misfit(start[0]), [start], 0, list[str]()
@@ -293,25 +294,15 @@ class _RestrictedProblem(FitProblem):
     def dtype(self) -> Any:
         return self.whole.dtype
 
-    def place(self, y: Float[Array, "f"]) -> Float[Array, "n"]:
-        """The coordinates of the whole problem."""
-        return self.origin + self.basis @ y
-
-    def coordinates(self, z: Coordinates) -> tuple[Array, ...]:
-        return self.whole.coordinates(self.place(z))
+    def unrestricted(self, z: Float[Array, "f"]) -> Float[Array, "n"]:
+        return self.origin + self.basis @ z
 
     def room(self, z: Coordinates) -> Float[Array, "2 f"]:
         """On planes of some of the coordinates."""
-        return jnp.where(self.basis.T != 0, self.whole.room(self.place(z))[:, None], jnp.inf).min(axis=2)
+        return jnp.where(self.basis.T != 0, self.whole.room(self.unrestricted(z))[:, None], jnp.inf).min(axis=2)
 
     def residuals(self, z: Coordinates, sigmas: Sigmas, adjoint: Any) -> tuple[Array, Array]:
-        return self.whole.residuals(self.place(z), sigmas, adjoint)
-
-
-@eqx.filter_jit
-def _residuals(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Array:
-    """The residuals, compiled."""
-    return problem.residuals(z, sigmas, None)[0]
+        return self.whole.residuals(self.unrestricted(z), sigmas, adjoint)
 
 
 _FARTHEST = 14.0

@@ -245,9 +245,9 @@ def settle_noise(problem: FitProblem, minimum: Search, sigmas: Sigmas) -> tuple[
             f"The noise of {observation.name!r} cannot be estimated from its {observation.count} numbers: the "
             "parameters use all of them up. Give its sigma.",
         )
-        floor = _LEAST * observation.scale() / float(np.max(sigma))
+        floor = _LEAST * observation.scale() / float(np.asarray(sigma).max())
         factor = max(factor, floor)
-        settled.append((sigma * factor, factor, freedom))
+        settled.append((jnp.asarray(np.asarray(sigma) * factor, sigma.dtype), factor, freedom))
         changing |= abs(factor - 1) > _NOISE_RTOL and factor > floor
     # Another noise of one observation, of squares alone and without priors, does not move the minimum.
     one = len(settled) == 1 and problem.observations[0].robust is None
@@ -368,7 +368,7 @@ def intervals(
     below, above = error * (root + pull), error * q**2 / (root + pull)
     at, slope = (np.asarray(a, float) for a in jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),)))
     straight = at - slope * np.minimum(below, down), at + slope * np.minimum(above, up)
-    curved = (problem.numbers(z + side * jnp.asarray(q * error, z.dtype)) for side in (-1, 1))
+    curved = (problem.numbers(jnp.asarray(np.asarray(z) + side * q * error, z.dtype)) for side in (-1, 1))
     meets, near = ((times * below >= down) | (times * above >= up) for times in (1, _BESIDE))
     lower, upper = (
         np.where(meets, line, np.where(near, farther(line, curve), curve))

@@ -12,6 +12,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float
 from mpmjax.checks import require, require_whole
+from mpmjax.fitting._evaluation import evaluated, parts_kept
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 
 
@@ -46,6 +47,12 @@ class AbstractOptimiser(eqx.Module):
         """One iteration from the state that `begin` or the last iteration returned: where it is now, the state, and
         what it knows of that place. The first one evaluates where it starts. A step at which a simulation fails must
         not be taken."""
+
+    def place(self, problem: FitProblem, state: Any) -> Coordinates | None:
+        """The one place at which the next iteration asks the problem for residuals and Jacobian, where that is all it
+        asks for: they are then computed by programs of their own. Default: None, an iteration is one program."""
+        del problem, state
+        return None
 
     def directed(self, z: Coordinates, state: Any, seen: Evaluation) -> Any:
         """The state for the next iteration, outside of what is compiled. Default: as it is."""
@@ -113,8 +120,8 @@ def search_many(
     done: Mapping[int, Search] | None = None,
     enough: Callable[[Search], bool] = lambda search: False,
     progress: Callable[[int, int], None] = lambda done, count: None,
-    begun: Callable[[int, Evaluation], None] = lambda number, seen: None,
-    report: Callable[[Search], None] = lambda state: None,
+    begun: Callable[[Sigmas, Evaluation], None] = lambda sigmas, seen: None,
+    report: Callable[[Sigmas, Search], None] = lambda sigmas, state: None,
 ) -> dict[int, Search]:
     """The least Σ r² of searches that differ in where they start or in their data, by their numbers.
 
@@ -133,8 +140,8 @@ def search_many(
         done: earlier searches, by their numbers, which are returned with the others.
         enough: says of each search that has ended whether those that wait need not begin; they are left out.
         progress: called with how many are done, and of how many.
-        begun: called with the number of a search and the evaluation where it starts, unless it fails there.
-        report: called after each iteration of each search.
+        begun: called with the noise of a search and the evaluation where it starts, unless it fails there.
+        report: called with the noise and the search after each iteration.
     """
     stacked = _stacked(problems)
     waiting, done = deque(starts), dict(done or {})
@@ -144,7 +151,7 @@ def search_many(
     def end(k: int, search: Search, **outcome: Any) -> None:
         """End a search; where it did not fail, with the residuals and the Jacobian."""
         if "failure" not in outcome:
-            problem, sigmas = _of(problems, k)
+            problem, sigmas = problems[0 if len(problems) == 1 else k]
             z, r, J = jnp.asarray(search.z).astype(problem.dtype), search.seen.residuals, search.seen.jacobian
             if r is None or J is None:
                 r, J = jacobian(problem, z, sigmas)
@@ -153,6 +160,11 @@ def search_many(
                 outcome |= {"failure": NO_DERIVATIVE, "converged": False}
         done[k] = search._replace(**outcome)
         del running[k]
+
+    def settled(history: tuple[Iteration, ...]) -> bool:
+        costs, moves = [i.cost for i in history], [i.cost for i in history if i.accepted]
+        slow = len(moves) > 1 and len(costs) > _ITERATIONS and costs[-1] > (1 - settling) * costs[-1 - _ITERATIONS]
+        return slow or (len(moves) > _MOVES and moves[-1] > (1 - settling) * moves[-1 - _MOVES])
 
     try:
         while True:
@@ -163,7 +175,7 @@ def search_many(
                     end(k, search, failure="the simulation fails where it starts, or does not reach the data")
                 elif not np.isfinite(search.history[-1].gradient):
                     end(k, search, failure=NO_DERIVATIVE)
-                elif _has_settled(search.history, settling) or optimiser.has_converged(search.inner, search.seen):
+                elif settled(search.history) or optimiser.has_converged(search.inner, search.seen):
                     end(k, search, converged=True)
                 elif spent or (settling == 0 and optimiser.has_stalled(search.inner)):
                     end(k, search)  # where searches settle, one that stalls goes on, and soon has settled
@@ -187,9 +199,10 @@ def search_many(
             running = {**states}
             for k, search in states.items():
                 if np.isfinite(search.cost) and np.isfinite(search.history[-1].gradient):
+                    _, sigmas = problems[0 if len(problems) == 1 else k]
                     if len(search.history) == 1:
-                        begun(k, search.seen)
-                    report(search)
+                        begun(sigmas, search.seen)
+                    report(sigmas, search)
     except KeyboardInterrupt:
         for k, search in list(running.items()):
             if search is not None:
@@ -197,10 +210,6 @@ def search_many(
     none = Search(jnp.zeros(0), None, Evaluation(jnp.zeros(()), jnp.zeros(0)), ())
     begun_none = {k: none._replace(interrupted=True, failure=_NOT_BEGUN) for k in starts}
     return dict(sorted((begun_none | done).items()))
-
-
-def _of(problems: Sequence[tuple[FitProblem, Sigmas]], k: int) -> tuple[FitProblem, Sigmas]:
-    return problems[0 if len(problems) == 1 else k]
 
 
 def _iterated(
@@ -215,14 +224,14 @@ def _iterated(
     before: dict[int, tuple[Coordinates, Any, tuple[Iteration, ...]]] = {}
     for k, search in running.items():
         if search is None:
-            problem, sigmas = _of(problems, k)
+            problem, sigmas = problems[0 if len(problems) == 1 else k]
             z = jnp.asarray(starts[k], float)  # optimistix's own numbers are of JAX's default precision
             before[k] = z, begin(problem, optimiser, z, sigmas), ()
         else:
             before[k] = search.z, search.inner, search.history
     if batch == 1:  # the program of a single search, which compiles in less time than a batch of one
         (k,), ((z, inner, _),) = before, before.values()
-        problem, sigmas = _of(problems, k)
+        problem, sigmas = problems[0 if len(problems) == 1 else k]
         ends = [iterate(problem, optimiser, z, sigmas, inner)]
     else:
         lanes = [*range(len(before)), *[0] * (batch - len(before))]
@@ -274,13 +283,6 @@ def _stacked(trees: Sequence[Any]) -> tuple[Any, Any]:
     return jax.tree.unflatten(structures[0], varying), jax.tree.unflatten(structures[0], common)
 
 
-def _has_settled(history: tuple[Iteration, ...], part: float) -> bool:
-    """Whether the last moves, or the last iterations, lowered the cost by less than this part."""
-    costs, moves = [i.cost for i in history], [i.cost for i in history if i.accepted]
-    slow = len(moves) > 1 and len(costs) > _ITERATIONS and costs[-1] > (1 - part) * costs[-1 - _ITERATIONS]
-    return slow or (len(moves) > _MOVES and moves[-1] > (1 - part) * moves[-1 - _MOVES])
-
-
 def batch_size(problem: FitProblem, batch: int | None, count: int) -> int:
     """How many points or searches of `count` to compute together. Default: eight with explicit steps, where they cost
     less than one by one, and one with implicit ones, where all wait for the slowest solve (`benchmarks/multistart.py`).
@@ -309,9 +311,19 @@ def begin(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sig
     return optimiser.begin(problem, z, sigmas)
 
 
-@eqx.filter_jit
 def iterate(
     problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas, inner: Any
+) -> tuple[Coordinates, Any, Evaluation]:
+    """An optimiser's `iterate`, compiled, or what it asks for and then what it makes of that."""
+    place = optimiser.place(problem, inner)
+    if place is None or (kept := parts_kept(problem, 1 + problem.size)) is None:
+        return iterate_alone(problem, optimiser, z, sigmas, inner)
+    return iterate_alone(evaluated(problem, place, z, sigmas, kept), optimiser, z, (), inner)
+
+
+@eqx.filter_jit
+def iterate_alone(
+    problem: Any, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas, inner: Any
 ) -> tuple[Coordinates, Any, Evaluation]:
     """An optimiser's `iterate`, compiled."""
     return optimiser.iterate(problem, z, sigmas, inner)
@@ -331,9 +343,17 @@ def iterate_together(
     return eqx.filter_vmap(one, in_axes=(0, 0, eqx.if_array(0)))(varying, z, inner)
 
 
-@eqx.filter_jit
 def jacobian(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array]:
     """The residuals and their Jacobian, compiled."""
+    if problem.cheaper_mode == "forward" and (kept := parts_kept(problem, 1 + problem.size)) is not None:
+        at = evaluated(problem, z, z, sigmas, kept)
+        return at.r, at.J
+    return _jacobian(problem, z, sigmas)
+
+
+@eqx.filter_jit
+def _jacobian(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array]:
+    """See `jacobian`: in one program."""
     return problem.jacobian(z, sigmas)
 
 

@@ -5,15 +5,15 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
-import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, Scalar
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_whole
-from mpmjax.fitting._problem import SHOWN, Coordinates, FitProblem, Sigmas, table
+from mpmjax.fitting._evaluation import costs_at
+from mpmjax.fitting._parameter import AbstractParameter
+from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas, table
 from mpmjax.fitting._search import AbstractOptimiser, Search, batch_size, counted, search_many
 
 Ends = list[tuple[Search, list[int]]]  # minima, with the numbers of the points that led there
@@ -207,34 +207,6 @@ def look_around(
     )
 
 
-def costs_at(
-    problem: FitProblem,
-    points: Float[np.ndarray, "k n"],
-    sigmas: Sigmas,
-    batch: int,
-    progress: Callable[[int, int], None] = lambda done, count: None,
-) -> Float[np.ndarray, "k"]:
-    """½ Σ r² at many points, without derivatives; NaN where a simulation fails. `batch` are computed together, and
-    `progress` is called with how many are done, and of how many."""
-    costs = np.empty(len(points))
-    for first in range(0, len(points), batch):
-        rows = points[np.minimum(np.arange(first, first + batch), len(points) - 1)]
-        costs[first : first + batch] = _costs(problem, rows, sigmas)[: len(points) - first]
-        progress(min(first + batch, len(points)), len(points))
-    return costs
-
-
-@eqx.filter_jit
-def _costs(problem: FitProblem, points: Float[np.ndarray, "b n"] | Array, sigmas: Sigmas) -> Float[Array, "b"]:
-    """½ Σ r² at some points together, compiled."""
-
-    def cost(z: Coordinates) -> Array:
-        r, _ = problem.residuals(z, sigmas, diffrax.ForwardMode())
-        return (r**2).sum() / 2
-
-    return jax.vmap(cost)(jnp.asarray(points, problem.dtype))
-
-
 def _end(members: dict[int, Search], k: int) -> int | None:
     """The number of the search at whose minimum a search ended; None if it came to none."""
     while (joined := members[k].joined) is not None:
@@ -311,9 +283,16 @@ def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], start
         for value in asked:
             parameter.check(name, np.asarray(value))
         values = np.concatenate([asked.reshape(-1, *first.shape), values])
-        z = parameter.coordinate(start, jnp.asarray(values, start.dtype))
-        columns.append(np.asarray(z, float).reshape(len(values), first.size))
+        if len(values):
+            values = _coordinates(parameter, start, values)
+        columns.append(np.asarray(values, float).reshape(len(values), first.size))
     return np.concatenate([np.zeros((1, problem.size)), np.concatenate(columns, axis=1)])
+
+
+@eqx.filter_jit
+def _coordinates(parameter: AbstractParameter, start: Array, values: np.ndarray | Array) -> Array:
+    """The coordinates of values, compiled."""
+    return parameter.coordinate(start, jnp.asarray(values, start.dtype))
 
 
 def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], fraction: Scalar) -> Int[np.ndarray, "k"]:
