@@ -289,7 +289,9 @@ def _angles(text: str) -> tuple[float, float]:
 @_reporting
 def render(
     path: RunPath,
-    output: Annotated[Path, typer.Option("--output", "-o", help="A picture: .png, .pdf, .svg, or .gif of all frames.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="A picture: .png, .pdf, .svg; a film: .gif or .mp4 of all frames.")
+    ],
     colour: Annotated[
         str,
         typer.Option(

@@ -1,5 +1,7 @@
 """Pictures: what hides what, which way is up and out, where walls and obstacles are."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import matplotlib.image
@@ -8,6 +10,7 @@ import pytest
 from helpers import LAWS, thorough
 
 import mpmjax as mpm
+import mpmjax.viz._render
 from mpmjax.simulation._run import no_steps
 from mpmjax.state._particles import State
 from mpmjax.viz._render import (
@@ -174,11 +177,14 @@ def test_obstacles_are_drawn(tmp_path, d):
     assert counts[1] > counts[0] + 100
 
 
-def test_disks_are_as_large_as_their_particles():
-    """In two dimensions the disks' area is the particles', measured in pixels."""
+@pytest.mark.parametrize("stretch", [1.0, 1.5])
+def test_squares_are_as_large_as_their_particles(stretch):
+    """In two dimensions the squares' area is the deformed particles', measured in pixels."""
     x = np.stack(np.meshgrid(np.arange(4.0), np.arange(3.0)), axis=-1).reshape(1, -1, 2)
     figure, draw = _flat_canvas(still_run(x, volume=0.3), None, "")
-    draw(still_run(x, volume=0.3).final, np.full(x.shape[1], np.nan), 0.0)
+    final = still_run(x, volume=0.3).final
+    F = final.deformations[0].at[:, 0].multiply(stretch)
+    draw(dataclasses.replace(final, deformations=(F,)), np.full(x.shape[1], np.nan), 0.0)
     figure.set_dpi(100)
     figure.canvas.draw()
     axes = figure.axes[0]
@@ -186,7 +192,7 @@ def test_disks_are_as_large_as_their_particles():
     box = np.round(axes.get_window_extent().extents).astype(int)
     image = np.asarray(figure.canvas.buffer_rgba())[::-1][box[1] + 3 : box[3] - 3, box[0] + 3 : box[2] - 3, 0]
     covered = ((255.0 - image) / (255 - image.min())).sum()
-    assert covered == pytest.approx(12 * 0.3 * scale**2, rel=0.02)
+    assert covered == pytest.approx(12 * 0.3 * stretch * scale**2, rel=0.02)
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
@@ -213,6 +219,58 @@ def test_a_movie_has_all_frames_of_one_size(tmp_path):
             frames.append(np.asarray(movie.convert("L"), float))
     left = [frame[20:-20, 30:80] for frame in frames]
     assert np.abs(left[0] - left[2]).max() < 30 < np.abs(frames[0] - frames[2]).max()
+
+
+def test_neighbours_of_a_stretched_body_leave_no_gap(tmp_path):
+    """A body whose particles have moved apart by its deformation is filled, its colours from neighbour to neighbour."""
+    a = np.arange(8.0)
+    x = np.stack(np.meshgrid(2 * a, a), axis=-1).reshape(1, -1, 2)
+    run = still_run(x, volume=1.0)
+    F = run.frames.deformations[0].at[..., 0, 0].set(2)
+    run = dataclasses.replace(run, frames=dataclasses.replace(run.frames, deformations=(F,)))
+    mpm.render(run, tmp_path / "a.png", colour="none", dpi=60.0)
+    image = matplotlib.image.imread(tmp_path / "a.png")
+    blue = image[..., 2] > image[..., 0] + 0.1
+    rows, columns = np.nonzero(blue)
+    assert blue[rows.min() : rows.max(), columns.min() : columns.max()].all()
+
+
+def test_colours_leave_out_what_is_rare_and_say_so():
+    """Of 200 particles one is a thousand times as fast; the bar is as high as the plot."""
+    x = np.stack(np.meshgrid(np.arange(20.0), np.arange(10.0)), axis=-1).reshape(1, -1, 2)
+    v = np.full_like(x, 1.0)
+    v[0, :100, 0], v[0, 0, 0] = 0.5, 1e3
+    figures = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mpmjax.viz._render, "save_figure", lambda figure, *_: figures.append(figure))
+        mpm.render(still_run(x, v=jnp.asarray(v)), "never.png")
+    (figure,), (axes,) = figures, figures[0].axes
+    figure.canvas.draw()
+    (bar,) = axes.child_axes
+    assert bar.get_ylabel() == "speed [m/s], 1st to 99th percentile"
+    assert bar.get_ylim()[1] < 2
+    plot, beside = axes.get_window_extent(), bar.get_window_extent()
+    np.testing.assert_allclose([beside.y0, beside.y1], [plot.y0, plot.y1], atol=1)
+
+
+def test_a_film_is_mp4_where_ffmpeg_is(tmp_path, monkeypatch):
+    """It gets each frame's pixels, and what it has against them is said; without it a .gif is proposed."""
+    x = np.zeros((3, 2, 2))
+    x[:, 1, 0] = [1.0, 1.5, 2.0]
+    run, path = still_run(x, volume=0.03), tmp_path / "a.mp4"
+    (tmp_path / "ffmpeg").write_text('#!/bin/sh\nfor name; do true; done\ncat > "$name"\n')
+    (tmp_path / "ffmpeg").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    mpm.render(run, path, dpi=30.0)
+    first, second, third = np.split(np.frombuffer(path.read_bytes(), np.uint8), 3)
+    assert not np.array_equal(first, second)
+    assert not np.array_equal(second, third)
+    (tmp_path / "ffmpeg").write_text("#!/bin/sh\necho no room >&2\nexit 1\n")
+    with pytest.raises(OSError, match=r"a\.mp4 could not be written: ffmpeg: no room\. It is as it was"):
+        mpm.render(run, path, dpi=30.0)
+    monkeypatch.setenv("PATH", str(tmp_path / "nowhere"))
+    with pytest.raises(ValueError, match="needs the program ffmpeg"):
+        mpm.render(run, path)
 
 
 def test_colours_by_what_a_law_remembers_and_by_material():

@@ -1,9 +1,5 @@
 """Pictures of runs and charts."""
 
+from mpmjax.viz._chart import draw_chart as draw_chart, write_trials as write_trials
 from mpmjax.viz._fit_report import draw_fit as draw_fit, write_fit as write_fit
-from mpmjax.viz._render import (
-    COLOURS as COLOURS,
-    draw_chart as draw_chart,
-    render as render,
-    write_trials as write_trials,
-)
+from mpmjax.viz._render import COLOURS as COLOURS, render as render

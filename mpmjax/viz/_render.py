@@ -1,7 +1,6 @@
-"""Pictures of runs by matplotlib: disks in two dimensions, shaded points sorted by depth in three. Charts of error
-against seconds."""
+"""Pictures and films of runs: deformed squares in two dimensions, shaded balls in three, on axes of matplotlib."""
 
-import csv
+import shutil
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -10,11 +9,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax.analysis import FIELDS, WorkPrecision, name_of, smoothed, volume_ratio
+from mpmjax.analysis import FIELDS, smoothed, volume_ratio
 from mpmjax.checks import canonical, checked, require, require_between, require_memory
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene, by_material, history_arrays
+from mpmjax.viz._pixels import disks, film_pictures, write_film
 
 COLOURS: dict[str, tuple[str, Callable[[Scene, Particles], Any]]] = {
     **{name: field for name, field in FIELDS.items() if name != "stress"},
@@ -22,12 +22,14 @@ COLOURS: dict[str, tuple[str, Callable[[Scene, Particles], Any]]] = {
 }
 """The quantities that can colour particles: a label, and a value for each particle."""
 _SMOOTHED = ("pressure", "von_mises")  # they oscillate from particle to particle
+_COUNTED = ("material", "particle")  # numbers, of which all are shown
 
 SNOW, OCHRE, STEEL, MOSS = (0.91, 0.93, 0.96), (0.82, 0.55, 0.33), (0.36, 0.5, 0.66), (0.45, 0.62, 0.42)
 STONE = (0.55, 0.54, 0.52)  # the colour of walls and colliders
 _MOST_CELLS = 90  # cells in a direction of the lattice by which particles are shaded
 
-Draw = Callable[[Particles, np.ndarray, float], None]
+Draw = Callable[[Particles, np.ndarray, float], list[Any]]
+"""Draws particles, with their values, at a time [s], and returns all that differs from frame to frame."""
 
 
 @checked
@@ -41,12 +43,15 @@ def render(
     fps: int = 20,
     dpi: float = 120.0,
 ) -> None:
-    """Draw a run: one frame as a still (.png, .pdf, .svg) or all of them as an animation (.gif).
+    """Draw a run: one frame as a still (.png, .pdf, .svg) or all of them as a film (.gif, or .mp4 where ffmpeg is).
 
-    In two dimensions particles are disks of their undeformed volume, walls are lines. In three they are points sorted
-    by depth, half as large again, so that they close into a body, and shaded by its surface in a light from the upper
-    left; up is against gravity's largest component (the last axis without gravity), and the ground is the highest wall
-    or plane that bears, else a little below the particles. All frames of a run have the same view and scale.
+    In two dimensions particles are squares of their undeformed volume that deform with them and so fill the body; where
+    a law yields, F has lost the shape, and they are half as large again. Walls are lines. In three they are balls
+    sorted by depth, half as large again, so that they close into a body, and shaded by its surface in a light from the
+    upper left; up is against gravity's largest component (the last axis without gravity), and the ground is the highest
+    wall or plane that bears, else a little below the particles. All frames of a run have the same view and scale.
+    Colours go from the 1st to the 99th percentile of all values shown, and the bar's label says so where a value lies
+    beyond.
 
     Args:
         run: a run with frames.
@@ -58,7 +63,7 @@ def render(
         frame: which frame a still shows; counts from the end if negative. Default: the last.
         view: in three dimensions, azimuth and elevation of the eye [degrees]. At azimuth 0 the first horizontal axis
             points to the right; the elevation is above 0 and at most 90.
-        fps: frames a second of an animation, from 1 to 100.
+        fps: frames a second of a film, from 1 to 100.
         dpi: resolution [dots an inch], from 1 to 6000.
 
     Raises:
@@ -66,7 +71,7 @@ def render(
             elevation that is not above the ground.
     """
     path = Path(path)
-    suffixes = (".png", ".pdf", ".svg", ".gif")
+    suffixes = (".png", ".pdf", ".svg", ".gif", ".mp4")
     require(path.suffix in suffixes, f"A picture's name must end in one of {', '.join(suffixes)}, got {path.name!r}.")
     colour = None if colour == "none" else colour
     require(len(run) > 0, "The run has no frames to draw: pass save_every to simulate.")
@@ -80,42 +85,45 @@ def render(
     require(
         frame is None or -len(run) <= frame < len(run), f"The run has {len(run)} frames, there is no frame {frame}."
     )
-    require(frame is None or path.suffix != ".gif", "frame is for a still; a .gif shows all frames.")
+    still = path.suffix not in (".gif", ".mp4")
+    require(frame is None or still, f"frame is for a still; a {path.suffix} shows all frames.")
+    can_be = path.suffix != ".mp4" or shutil.which("ffmpeg")
+    require(can_be, "A .mp4 needs the program ffmpeg, which is not there: install it, or write a .gif.")
     require_between("fps", fps, 1, 100)  # a GIF counts hundredths of a second
     require_between("dpi", dpi, 1, 6000)  # matplotlib draws fewer than 2^16 pixels a side
-    require_memory(f"A picture of {dpi:g} dots an inch", 4 * 8 * 6 * dpi**2, "take a smaller dpi.")
+    require_memory(f"A picture of {dpi:g} dots an inch", 64 * 8 * 6 * dpi**2, "take a smaller dpi.")
     require_between("view's azimuth [degrees]", view[0], -360, 360)
     require_between("view's elevation [degrees]", view[1], 0.1, 90)
-    still = path.suffix != ".gif"
     shown = [len(run) - 1 if frame is None else frame % len(run)] if still else range(len(run))
     label, value = ("", lambda scene, q: np.full(q.count, np.nan)) if colour is None else quantities[colour]
     values = np.stack([np.asarray(value(run.scene, run.frame(i)), float) for i in shown])
     if colour in _SMOOTHED:
-        each = zip(shown, values, strict=True)
-        values = np.stack([np.asarray(smoothed(run.scene, run.frame(i), jnp.asarray(a))) for i, a in each])
-    from matplotlib import (  # here, since it takes a second that only pictures should pay
-        animation,
-        cm,
-        colors,
-        pyplot as plt,
-    )
+        each = [jnp.asarray(a, run.final.x.dtype) for a in values]
+        values = np.stack([np.asarray(smoothed(run.scene, run.frame(i), a)) for i, a in zip(shown, each, strict=True)])
+    from matplotlib import cm, colormaps, colors, pyplot as plt  # here: it takes a second that only pictures should pay
 
     bar = None
     if colour is not None:
-        bar = cm.ScalarMappable(colors.Normalize(np.nanmin(values), np.nanmax(values)), "viridis")
+        least, most = np.nanmin(values), np.nanmax(values)
+        low, high = (least, most) if colour in _COUNTED else np.nanpercentile(values, (1, 99))
+        low, high = (low, high) if low < high else (least, most)
+        colours: Any = colormaps["viridis"].copy()
+        colours.colorbar_extend = ("neither", "max", "min", "both")[2 * bool(least < low) + bool(most > high)]
+        label += ", 1st to 99th percentile" * (colours.colorbar_extend != "neither")
+        bar = cm.ScalarMappable(colors.Normalize(low, high), colours)
     figure, draw = _solid_canvas(run, bar, label, view) if run.final.dim == 3 else _flat_canvas(run, bar, label)
+    figure.set_dpi(dpi)
 
-    def show(k: int) -> None:
-        draw(run.frame(shown[k]), values[k], float(run.times[shown[k]]))
+    def show(k: int) -> list[Any]:
+        return draw(run.frame(shown[k]), values[k], float(run.times[shown[k]]))
 
     try:
         if still:
             show(0)
             save_figure(figure, path, dpi)
         else:
-            movie = animation.FuncAnimation(figure, lambda k: show(k) or [], frames=len(values), init_func=lambda: [])
             with replacing(path) as aside:
-                movie.save(aside, writer=animation.PillowWriter(fps=fps), dpi=dpi)
+                write_film(film_pictures(figure, show, len(values)), aside, fps)
     finally:
         plt.close(figure)
 
@@ -130,12 +138,27 @@ def _remembered(name: str, scene: Any, particles: Particles) -> np.ndarray:
     return values
 
 
+def _colour_of(material: int, d: int) -> tuple[float, float, float]:
+    """The colour of a material that has no values."""
+    palette = (SNOW, OCHRE, STEEL, MOSS) if d == 3 else (STEEL, OCHRE, MOSS, SNOW)
+    return palette[material % len(palette)]
+
+
+def _legend(axes: Any, scene: Scene) -> None:
+    """Name the materials by their colours, where there are several."""
+    from matplotlib.patches import Patch
+
+    colours = [_colour_of(i, scene.grid.dim) for i in range(len(scene.laws))]
+    patches = [Patch(facecolor=c, edgecolor="0.5", label=t) for c, t in zip(colours, scene.titles, strict=True)]
+    if len(patches) > 1:
+        axes.legend(handles=patches, loc="upper right", fontsize=8).set_zorder(5)
+
+
 def _tinted(particles: Particles, bar: Any, values: np.ndarray) -> np.ndarray:
     """The particles' colours, (p, 3): by their values, and where there are none by their material."""
-    palette = (SNOW, OCHRE, STEEL, MOSS) if particles.dim == 3 else (STEEL, OCHRE, MOSS, SNOW)
     colours = np.empty((particles.count, 3))
     for i, (rows, *_) in enumerate(by_material(particles)):
-        colours[rows] = palette[i % len(palette)]
+        colours[rows] = _colour_of(i, particles.dim)
     if bar is None:
         return colours
     return np.where(np.isnan(values)[:, None], colours, bar.to_rgba(values)[:, :3])
@@ -222,37 +245,51 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
         axis.set_tick_params(pad=11 * away - 8)
         axis.labelpad = 25 * away - 21
         axis.set_major_locator(ticker.MaxNLocator(max(2, round(5 * side))))  # labels of a short side would overlap
+    title = axes.set_title(" ")
     if bar is not None:
-        figure.colorbar(bar, cax=figure.add_axes((0.88, 0.28, 0.018, 0.44)), label=label)
-    # points of paper to a metre at the middle, along the picture's horizontal
+        figure.colorbar(bar, cax=figure.add_axes((0.88, 0.1, 0.018, 0.78)), label=label)
+    else:
+        _legend(axes, run.scene)
     azimuth, elevation = np.radians(view)
     right = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     ends = np.stack([(lower + upper) / 2 - right * size, (lower + upper) / 2 + right * size])
-    place = np.stack(proj3d.proj_transform(ends[:, 0], ends[:, 1], ends[:, 2], axes.get_proj())[:2], axis=1)
     figure.canvas.draw()
-    metre = float(np.linalg.norm(np.diff(axes.transData.transform(place), axis=0))) / (2 * size) * 72 / figure.dpi
+    over: Any = figure.add_axes((0, 0, 1, 1), zorder=4)  # the particles' pixels
+    over.axis("off")
+
+    def on_paper(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The pixels of points, counted from the upper left, (n, 2), and how far they are."""
+        across, along, depth = proj3d.proj_transform(x[:, 0], x[:, 1], x[:, 2], axes.get_proj())
+        pixels = axes.transData.transform(np.stack([across, along], axis=1))
+        return np.stack([pixels[:, 0], figure.bbox.height - pixels[:, 1]], axis=1), np.asarray(depth)
+
     back = np.array([np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
     light = 0.55 * back - 0.45 * right + np.array([0, 0, 0.7])  # from the upper left
     light = light / np.linalg.norm(light)
-    shown: list[Any] = []
 
-    def draw(particles: Particles, values: np.ndarray, t: float) -> None:
+    def draw(particles: Particles, values: np.ndarray, t: float) -> list[Any]:
         x, (rock, normal) = np.asarray(particles.x, float) @ turn.T, stones(t)
         normals = np.concatenate([_outward(x, volume), normal])
         facing = (normals @ light)[:, None]
         colour = np.concatenate([_tinted(particles, bar, values), np.tile(STONE, (len(rock), 1))])
         colour = np.clip(colour * np.where(facing > 0, 0.75 + 0.3 * facing, 0.75 + 0.4 * facing), 0, 1)
         wide = np.concatenate([diameter, np.full(len(rock), 3 * spacing)])
-        while shown:
-            shown.pop().remove()
         every = np.concatenate([x, rock])
         shadow = np.column_stack([every[:, :2], np.full(len(every), ground)])
-        for at, colours, order in ((shadow, "0.8", 1), (every, colour, 2)):
-            points = axes.scatter(
-                *at.T, s=(wide * metre) ** 2, c=colours, depthshade=False, linewidth=0, zorder=order, rasterized=True
-            )
-            shown.append(points)
-        axes.set_title(f"t = {t:.4g} s")
+        metre = float(np.linalg.norm(np.diff(on_paper(ends)[0], axis=0))) / (2 * size)  # in pixels, at the middle
+        (flat, _), (place, depth) = on_paper(shadow), on_paper(every)
+        order = np.argsort(-depth)
+        image = disks(
+            figure.canvas.get_width_height(),
+            np.concatenate([flat, place[order]]),
+            np.concatenate([wide, wide[order]]) * metre / 2,
+            np.concatenate([np.full((len(flat), 3), 0.8), colour[order]]),
+        )
+        for before in list(over.images):
+            before.remove()
+        pixels = over.imshow(image, extent=(0, 1, 0, 1), aspect="auto", interpolation="nearest")
+        title.set_text(f"t = {t:.4g} s")
+        return [pixels, title]
 
     return figure, draw
 
@@ -278,7 +315,7 @@ def _outward(x: np.ndarray, volume: np.ndarray) -> np.ndarray:
 def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
     """A figure of one or two dimensions with axes that hold every frame, and what draws one."""
     from matplotlib import pyplot as plt
-    from matplotlib.collections import EllipseCollection
+    from matplotlib.collections import PolyCollection
 
     assert run.frames is not None
     d, grid = run.final.dim, run.scene.grid
@@ -317,22 +354,28 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
         line, span = (axes.axvline, axes.axvspan) if axis == 0 else (axes.axhline, axes.axhspan)
         line(at, color=STONE, lw=1.5, zorder=3)
         span(at, at - side * 1e3 * extent, color=STONE, alpha=0.35, lw=0)
-    width = volume if d == 1 else 2 * np.sqrt(volume / np.pi)
-    width = np.concatenate([width, width]) if grid.axisymmetric else width
-    disks: Any = EllipseCollection(
-        width, width, 0.0, units="x", offsets=np.zeros((1, 2)), offset_transform=axes.transData
-    )
-    axes.add_collection(disks)
+    half = np.stack([volume / 2, np.full(len(volume), 0.1)] if d == 1 else [np.sqrt(volume) / 2] * 2, axis=1)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half[:, None]
+    squares: Any = PolyCollection([], linewidths=0, antialiaseds=False)  # whose edges would show between them
+    axes.add_collection(squares, autolim=False)
+    title = axes.set_title(" ")
     if bar is not None:
-        figure.colorbar(bar, ax=axes, label=label)
+        figure.colorbar(bar, cax=axes.inset_axes((1.03, 0, 0.04, 1)), label=label)
+    else:
+        _legend(axes, run.scene)
     lattice = np.stack(np.meshgrid(*np.linspace(lower, upper, 200).T), axis=-1)
     stones: list[Any] = []
 
-    def draw(particles: Particles, values: np.ndarray, t: float) -> None:
-        place = whole(np.asarray(particles.x))
-        disks.set_offsets(place if d == 2 else np.column_stack([place, np.zeros(len(place))]))
-        colours = _tinted(particles, bar, values)
-        disks.set_facecolor(np.concatenate([colours, colours]) if grid.axisymmetric else colours)
+    def draw(particles: Particles, values: np.ndarray, t: float) -> list[Any]:
+        place, F = np.zeros((particles.count, 2)), np.tile(np.eye(2), (particles.count, 1, 1))
+        place[:, :d] = particles.x
+        for rows, stored, history in by_material(particles):
+            a = np.asarray(stored)
+            F[rows, :d, :d] = a[:, :d, :d] if a.ndim == 3 else a[:, None, None] ** (1 / d) * np.eye(d)
+            F[rows] *= 1.0 if history is None else 1.5
+        square, colours = place[:, None] + np.einsum("pij,pkj->pki", F, corners), _tinted(particles, bar, values)
+        squares.set_verts(whole(square))
+        squares.set_facecolor(np.concatenate([colours, colours]) if grid.axisymmetric else colours)
         while stones:
             stones.pop().remove()
         for distance in _obstacles(run.scene, t) if d == 2 else ():
@@ -340,48 +383,7 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
             there = np.column_stack([np.abs(there[:, 0]), there[:, 1]]) if grid.axisymmetric else there
             inside = distance(there).reshape(lattice.shape[:-1])
             stones.append(axes.contourf(*lattice.T.swapaxes(1, 2), inside, [-np.inf, 0.0], colors=[STONE]))
-        axes.set_title(f"t = {t:.4g} s")
+        title.set_text(f"t = {t:.4g} s")
+        return [squares, *stones, title]
 
     return figure, draw
-
-
-def draw_chart(comparison: WorkPrecision, path: Path) -> Path:
-    """Error over seconds, a line for each method and grid.
-
-    Runs that failed and runs that were only foreseen stand at the upper edge; the error that was asked for is a line,
-    and below the reference run's own error nothing is certain.
-    """
-    from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
-
-    figure, axes = plt.subplots(figsize=(7.2, 4.8), layout="constrained")
-    lines = list(dict.fromkeys((name_of(t.method), t.refinement) for t in comparison.trials))
-    names = list(dict.fromkeys(name for name, _ in lines))
-    top = 2 * max((t.error for t in comparison.trials if np.isfinite(t.error)), default=1.0)
-    for name, refinement in lines:
-        trials = [t for t in comparison.trials if (name_of(t.method), t.refinement) == (name, refinement)]
-        colour, dashes = f"C{names.index(name)}", "-" if refinement == 1 else "--"
-        label = name if refinement == 1 else f"{name}, spacing / {refinement}"
-        good = sorted((t.seconds, t.error) for t in trials if np.isfinite(t.error))
-        seconds, errors = zip(*good, strict=True) if good else ((), ())
-        axes.plot(seconds, errors, dashes, color=colour, marker="o", markersize=4, label=label)
-        for mark, test in (("x", np.isinf), (">", np.isnan)):
-            bad = [t.seconds for t in trials if test(t.error)]
-            axes.plot(bad, [top] * len(bad), mark, color=colour)
-    axes.axhline(comparison.target, color="black", linewidth=0.8)
-    axes.axhspan(0, comparison.reference.error, color="0.92")
-    axes.set(xscale="log", yscale="log", xlabel="seconds", ylabel="relative error of the motion")
-    axes.set_title("x failed, > foreseen; grey: less than the reference's own uncertainty", fontsize=9)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=7)
-    save_figure(figure, path, 140)
-    plt.close(figure)
-    return path
-
-
-def write_trials(comparison: WorkPrecision, path: Path) -> Path:
-    """The trials as CSV; an error of inf is a run that failed, of nan one that was foreseen to take too long."""
-    with replacing(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(["method", "refinement", "dt_s", "steps", "seconds", "error", "linearisation_error"])
-        rows.writerows([name_of(t.method), *t[1:]] for t in comparison.trials)
-    return path
