@@ -10,12 +10,13 @@ from textwrap import dedent
 
 import pytest
 
-from mpmjax.io._schema import saved_classes
+from mpmjax.io._schema import decode, saved_classes
 
 ROOT = Path(__file__).parents[1]
 PAGES = {p.relative_to(ROOT).as_posix(): p for p in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"))}
 SNIPPET = re.compile(r"^( *)```python\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
-"""A block that runs. One that cannot run as it stands is opened by ```python no-run: and the reason."""
+"""A block of Python: every one runs as it stands."""
+TOML = re.compile(r"```toml\n(.*?)```", re.DOTALL)
 CONTINUED = {"docs/features.md": "README.md"}
 """Pages whose snippets continue those of another page, as they say."""
 
@@ -93,18 +94,28 @@ def test_equations_that_are_cited_stand_in_the_derivation():
     assert not {number: name for number, name in cited.items() if number not in there}
 
 
+def test_every_block_of_python_is_one_that_runs():
+    for page, path in PAGES.items():
+        assert len(re.findall("```python", path.read_text(encoding="utf-8"))) == len(snippets(page)), page
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("page", [page for page in PAGES if page != "README.md" and snippets(page)])
 def test_the_snippets_of_a_page_run_in_their_order(page, tmp_path):
-    """As one program, in an empty folder beside the examples."""
+    """As one program, in an empty folder beside the examples; a TOML block with laws then names what is there."""
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     code = "\n".join((*(snippets(CONTINUED[page]) if page in CONTINUED else ()), *snippets(page)))
+    laws = [tomllib.loads(text)["material"] for text in TOML.findall(PAGES[page].read_text("utf-8")) if "[mat" in text]
+    code += "".join(
+        f"\nfrom mpmjax.io import decode\ndecode({law!r}, mpm.AbstractMaterial, '[material]')" for law in laws
+    )
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
 
 
-def test_toml_snippets_can_be_read_and_are_those_of_the_example():
-    """Tables of docs/fitting.md stand in examples/rubber.toml."""
+def test_toml_blocks_say_what_files_can_say():
+    """Those of docs/fitting.md stand in examples/rubber.toml, that of docs/extending.md names a law which its snippets
+    register; no page has others."""
 
     def within(part, whole):
         if isinstance(part, dict):
@@ -112,11 +123,22 @@ def test_toml_snippets_can_be_read_and_are_those_of_the_example():
         tables = isinstance(part, list) and part and isinstance(part[0], dict)
         return all(any(within(a, b) for b in whole) for a in part) if tables else part == whole
 
-    blocks = {page: re.findall(r"```toml\n(.*?)```", p.read_text("utf-8"), re.DOTALL) for page, p in PAGES.items()}
-    tables = {page: [tomllib.loads(block) for block in each] for page, each in blocks.items()}
+    tables = {page: list(map(tomllib.loads, TOML.findall(p.read_text("utf-8")))) for page, p in PAGES.items()}
     example = tomllib.loads((ROOT / "examples/rubber.toml").read_text(encoding="utf-8"))
-    assert len(tables["docs/fitting.md"]) == 2
     assert all(within(table, example) for table in tables["docs/fitting.md"])
+    laws = [f"class {table['material']['kind']}(" for table in tables["docs/extending.md"]]
+    assert all(any(law in code for code in snippets("docs/extending.md")) for law in laws)
+    assert {page: len(each) for page, each in tables.items() if each} == {"docs/fitting.md": 2, "docs/extending.md": 1}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_tables_within_a_line_can_be_read(page):
+    """Each `{ kind = "...", ... }` without dots, of a kind that is the package's, makes an object."""
+    kinds = {c.__name__: c for c in saved_classes()}
+    for text in re.findall(r"`(\{ kind = [^`]*\})`", PAGES[page].read_text(encoding="utf-8")):
+        if "..." not in text:
+            table = tomllib.loads(f"table = {text}")["table"]
+            assert isinstance(decode(table, kinds[table["kind"]]), kinds[table["kind"]]), text
 
 
 def test_the_page_of_a_step_names_files_and_functions_that_exist():

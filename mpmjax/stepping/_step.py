@@ -209,6 +209,14 @@ def step(
     P2G; the update of the nodes' velocity by `method`; G2P with x ← x + Δt Σ_i w_ip v̄_i and F ← F + Δt Σ_i v̄_i h_ipᵀ;
     the return map of laws that yield. v̄ is v^{n+1} or, for methods of second order, the mean velocity over the step.
 
+    Reverse mode through a loop of steps stores all that a step computes. Under `jax.checkpoint` it stores the particles
+    and computes the step again (57 in place of 235 B a particle and explicit step in 2-D and float32):
+
+        body = jax.checkpoint(lambda particles, t: (mpm.step(scene, particles, t, dt)[0], None))
+        final, _ = jax.lax.scan(body, mpm.prepare(scene, particles), dt * jnp.arange(steps))
+
+    Implicit solves are then done twice; `simulate` keeps their results and bounds the memory, by `checkpoint_bytes`.
+
     Args:
         scene: the scene.
         particles: the particles, prepared if they are not (see `prepare`).
