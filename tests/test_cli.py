@@ -83,6 +83,9 @@ def test_run_writes_the_frames_and_a_summary(folder):
         assert "pressure" not in file["VTKHDF/PointData"]
     summary = (folder / "summary").read_text()
     assert re.search(r"steps +6 of 0.01 s with SemiImplicit", summary)
+    assert re.search(
+        r"\nstages +\S+ s set-up, \S+ s compiling, \S+ s steps\nend +t = 0.06 s, 4 frames\nwritten", summary
+    )
     for word in ("particle-steps per second", "iterations a step", "total energy", "mass"):
         assert word in summary
     lost = re.search(r"relative error of the grid's mass ([-+.e\d]+)", summary)
@@ -577,6 +580,7 @@ def test_a_stable_step_is_taken_and_told(tmp_path):
     assert code == 0, err
     chosen = re.search(r"chosen +dt = ([-.e\d]+) s \((\d+) steps\), the longest that is stable", out)
     assert chosen is not None, out
+    assert re.search(r"\ndt +\S+ of the longest that is stable", out)
     run, file = mpm.load(tmp_path / "run.h5"), read_scene_file(scene)
     assert int(run.statistics.steps) == int(chosen[2])
     np.testing.assert_allclose(float(run.dt) * int(chosen[2]), 0.06)

@@ -580,6 +580,9 @@ def test_progress_is_shown_on_standard_error(tmp_path, capsys):
     out, err = capsys.readouterr()
     assert out == ""
     assert "14/14" in err
+    first, *later = err.split("\r")[1:]
+    assert first.startswith("compiling:")  # which is not counted in the time left
+    assert not any("compiling" in line for line in later)
 
 
 # What is refused -----------------------------------------------------------------------------------------------------

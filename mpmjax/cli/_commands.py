@@ -4,6 +4,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from mpmjax.fitting import (
     predict_observations,
     profile,
 )
-from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, replacing, reporting, steps_in, stopping, table
+from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, replacing, reporting, standing_in, stopping, table
 from mpmjax.native import BACKENDS, backend
 from mpmjax.simulation import Problem, Run, initial_state, no_steps, run_to
 from mpmjax.state import Particles
@@ -45,11 +46,12 @@ def run_scene(
     most_seconds: float | None = None,
 ) -> None:
     """Simulate a scene file after changes to it, and write the run's frames."""
-    done = steps_in(output) if resume else 0
+    done = standing_in(output)[1] if resume else 0
     if not resume:
         check_place(output, overwrite=overwrite)
+    started, compiled = time.perf_counter(), _compilation()
     simulation = _chosen(path, most_seconds, changes, quiet=quiet)
-    begun = time.perf_counter()
+    begun, before = time.perf_counter(), compiled[0]
     run = record(
         output,
         simulation.scene,
@@ -61,10 +63,29 @@ def run_scene(
         progress=not quiet,
     )
     taken, seconds = int(run.statistics.steps) - done, time.perf_counter() - begun
+    compiling, frames = min(compiled[0] - before, seconds), standing_in(output)[0]
     with reporting(lambda: f"{output} is complete."):
         print(_summary(simulation.particles, run, taken, seconds))
+        bound = float(stable_dt(run.scene, run.final, method=run.method)) if taken else np.inf
+        if np.isfinite(bound):
+            print(f"{'dt':<18} {float(run.dt) / bound:.3g} of the longest that is stable as particles are at the end")
+        stages = f"{begun - started:.3g} s set-up, {compiling:.3g} s compiling, {seconds - compiling:.3g} s steps"
+        print(f"{'stages':<18} {stages}")
+        print(f"{'end':<18} t = {float(run.final_step * run.dt):.6g} s, {frames} frames")
     reached = f"complete already: it reaches t = {float(run.final_step * run.dt):.6g} s" if resume and not taken else ""
     print(f"written            {output} ({_bytes(output.stat().st_size)}) {reached}".rstrip())
+
+
+@cache
+def _compilation() -> list[float]:
+    """The seconds that XLA has compiled in this process since the first call."""
+    spent = [0.0]
+
+    def add(event: str, duration_secs: float, **_: Any) -> None:
+        spent[0] += duration_secs if event.endswith("backend_compile_duration") else 0.0
+
+    jax.monitoring.register_event_duration_secs_listener(add)
+    return spent
 
 
 def _chosen(scene: Path, most_seconds: float | None, changes: Sequence[str] = (), *, quiet: bool = False) -> Simulation:
@@ -125,6 +146,11 @@ def _summary(start: Particles, run: Run, taken: int = 0, seconds: float = 0.0) -
             "particles a cell, or TotalLagrangian",
         ),
     ]
+    end = float(run.final_step * run.dt)
+    for what, received in (("collider", run.final_collider_impulse), ("boundary", run.final_boundary_impulse)):
+        for k, impulse in enumerate(() if received is None else np.asarray(received.impulse)):
+            force = ", ".join(f"{a:.6g}" for a in impulse / end) if end > 0 else ""
+            lines.append((end > 0, f"on {what} {k}", f"a mean force of {force} N"))
     for name in ("kinetic", "elastic", "potential", "total"):
         a, b = float(getattr(before, name)), float(getattr(after, name))
         lines.append((True, f"{name} energy", f"{a + 0.0:.6g} J to {b + 0.0:.6g} J, change {b - a:+.3g} J"))

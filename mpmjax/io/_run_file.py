@@ -397,13 +397,13 @@ def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, data.item() if isinstance(data, np.generic) else data
 
 
-def steps_in(path: Path) -> int:
-    """How many steps led to the last frame of a file, −1 if that is not known. Raises what `load` does, and for a file
-    that is being written."""
+def standing_in(path: Path) -> tuple[int, int]:
+    """The number of frames of a file, and how many steps led to the last, −1 if that is not known. Raises what `load`
+    does, and for a file that is being written."""
     require_no_writer(path)
     with reading(path) as file:
         require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
-        return int(file["mpmjax/frames"][count_in(file) - 1]["steps"])
+        return count_in(file), int(file["mpmjax/frames"][count_in(file) - 1]["steps"])
 
 
 def check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:

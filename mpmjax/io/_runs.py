@@ -16,6 +16,7 @@ A file is read only if it holds all of its data itself: HDF5 follows links to ot
 
 import os
 import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -124,7 +125,8 @@ def record(
             int(statistics.fault) == Fault.NONE,
             f"{path} ends with a fault after step {step} and would meet it again: start anew with another dt or scene.",
         )
-        bar = tqdm(initial=step, total=max(step, end), unit="step", file=sys.stderr, disable=not progress)
+        told: dict[str, Any] = {"unit": "step", "smoothing": 0, "file": sys.stderr, "disable": not progress}
+        bar = tqdm(initial=step, total=max(step, end), desc="compiling" if step < end else None, **told)
 
         def stopped() -> str:
             bar.close()
@@ -146,6 +148,9 @@ def record(
                 healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
                 if healthy:
                     append(step, state, statistics)
+                    if progress and bar.desc:  # the first steps compile, which says nothing of the time left
+                        bar.set_description(refresh=False)
+                        bar.initial, bar.start_t = step, time.time()
                     bar.update(count)
         run = run_to(problem, state, step, statistics)
         try:
