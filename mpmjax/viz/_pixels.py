@@ -46,9 +46,9 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, fps: int) -> None:
             process.stdin.close()
         except BrokenPipeError:
             pass  # it says why
-        errors = process.stderr.read().decode(errors="replace").splitlines()
+        message = process.stderr.read().decode(errors="replace").strip()
     if process.returncode:
-        raise OSError(f"ffmpeg: {errors[-1] if errors else 'it failed'}")
+        raise OSError(f"ffmpeg: {message.splitlines()[-1] if message else 'it failed'}")
 
 
 def disks(size: tuple[int, int], place: np.ndarray, radius: np.ndarray, colour: np.ndarray) -> np.ndarray:
