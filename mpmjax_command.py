@@ -6,6 +6,7 @@ Ctrl-C ends the command as quietly as SIGTERM does, not with a traceback of what
 
 import importlib
 import importlib.util
+import json
 import os
 import re
 import signal
@@ -337,6 +338,16 @@ def info(
     _require_folder(table)
     with _package(imports) as cli:
         print(cli.installation() if path is None else cli.describe_run(path, table))
+
+
+@app.command()
+@_reporting
+def schema(imports: Imports = None) -> None:
+    """Print the JSON schema of scene files, for editors.
+
+    Save it, and begin a scene file with the line "#:schema scene.schema.json"."""
+    with _package(imports) as cli:
+        print(json.dumps(cli.scene_schema(), indent=1))
 
 
 @app.command()

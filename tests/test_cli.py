@@ -1,8 +1,10 @@
 """Each command of the shell, on good input and on bad: one clear line, exit code 2, no traceback, nothing lost."""
 
+import json
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import equinox as eqx
@@ -219,6 +221,45 @@ def test_a_reader_who_has_enough_ends_a_command_quietly():
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 1
+
+
+def valid(value, schema, defs):
+    """Whether a value is what a JSON schema says, in the words that `mpmjax schema` uses."""
+    types = {"object": dict, "array": list, "number": int | float, "integer": int, "boolean": bool, "string": str}
+    schema = defs[schema["$ref"].removeprefix("#/$defs/")] if "$ref" in schema else schema
+    kinds = schema.get("type", [])
+    kinds = [kinds] if isinstance(kinds, str) else kinds
+    if kinds and not any(isinstance(value, types[kind]) for kind in kinds):
+        return False
+    if isinstance(value, dict) and "properties" in schema:
+        known = schema["properties"]
+        inside = all(valid(v, known[k], defs) for k, v in value.items() if k in known)
+        return inside and set(schema["required"]) <= set(value) <= set(known)
+    if isinstance(value, list) and "items" in schema:
+        return all(valid(v, schema["items"], defs) for v in value)
+    fits = value == schema.get("const", value) and value in schema.get("enum", [value])
+    return fits and ("anyOf" not in schema or any(valid(value, each, defs) for each in schema["anyOf"]))
+
+
+def test_the_schema_holds_the_examples_and_no_slip():
+    """It is derived from what reads the files, so that editors know each key."""
+    code, out, err = shell("schema")
+    assert code == 0, err
+    schema = json.loads(out)
+    assert {"Intersection", "Mesh", "NeoHookean", "Newton"} <= set(schema["$defs"])
+    assert schema["$defs"]["NeoHookean"]["required"] == ["youngs_modulus", "poisson_ratio"]
+    for path in EXAMPLES.glob("*.toml"):
+        assert valid(tomllib.loads(path.read_text()), schema, schema["$defs"]), path
+    table = tomllib.loads(SCENE)
+    assert valid(table, schema, schema["$defs"])
+    for slip in (
+        {"gravitty": [0.0, 1.0]},
+        {"grid": {"shape": [8, 8]}},
+        {"material": {"kind": "NeoHookean", "youngs_modulus": "soft", "poisson_ratio": 0.3}},
+        {"boundary": [{"kind": "SlipBox", "lower": [0.0], "upper": [1.0], "friction": 0.1}]},
+        {"run": {"dt": 0.1}},
+    ):
+        assert not valid(table | slip, schema, schema["$defs"]), slip
 
 
 def test_an_example_is_copied_with_its_data(tmp_path, monkeypatch):

@@ -8,4 +8,4 @@ from mpmjax.cli._commands import (
     installation as installation,
     run_scene as run_scene,
 )
-from mpmjax.cli._scene_file import load_scene as load_scene
+from mpmjax.cli._scene_file import load_scene as load_scene, scene_schema as scene_schema
