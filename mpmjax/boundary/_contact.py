@@ -349,7 +349,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         total = [reduce(jnp.add, each) / len(orders) for each in zip(*by_order, strict=True)]
         # v has been unfolded: its changes follow the walls, and are not scaled again
         walls = Mirror(tuple(image for image in self.images.images if isinstance(image, WallImage)))
-        return v + walls.unfold(sum(total)), tuple(map(walls.unfold, total))
+        return v + walls.unfold(reduce(jnp.add, total)), tuple(map(walls.unfold, total))
 
 
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
