@@ -133,6 +133,7 @@ FITTING = {
         "seed": 0,
         "batch": 1,
     },
+    mpm.fitting.Shown: {"unit": -1.0, "path": [[0.0, 1.0], [0.0, 2.0]]},
     mpm.fitting.Extent: {"axis": 0},
     mpm.fitting.Density: {"grid": SCENE.grid},
 }
@@ -199,6 +200,9 @@ MAY = {
     (mpm.fill, "velocity"),
     (mpm.fill_mapped, "velocity"),
     (mpm.Experiment, "name"),
+    (mpm.fitting.Shown, "x"),
+    (mpm.fitting.Shown, "y"),
+    (mpm.fitting.Shown, "columns"),
     (mpm.fitting.Adam, "learning_rate"),
     (mpm.fitting.predict, "of"),
     (mpm.fit, "log"),
@@ -247,7 +251,7 @@ def given(call: Callable, arguments: dict) -> object:
     return call(*[arguments[name] for name in several], **{k: v for k, v in arguments.items() if k not in several})
 
 
-NONE = ("boundary", "loads", "also", "deformations", "histories", "methods", "refinements", "points")
+NONE = ("boundary", "loads", "also", "deformations", "histories", "methods", "refinements", "points", "names", "fields")
 WHERE_USED = ("start", "only", "mean", "sigma")
 TAKEN = {
     *((name, "empty") for name in (*NONE, *WHERE_USED)),

@@ -22,11 +22,11 @@ def test_bad_arguments_end_in_value_errors(tmp_path):
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
-MADE_BY_THE_PACKAGE = """Bootstrap EnsembleFit FitResult Prediction
+MADE_BY_THE_PACKAGE = """Bootstrap EnsembleFit FitResult
 Profile RefinedFit Run Screening Markers StressStretch"""
 """Classes of what the package returns, or what a step is made of."""
 WITHOUT_ARGUMENTS = "CentreOfMass backend"
-BY_THEMSELVES = "register read_columns FitProblem Columns after read_arrays"
+BY_THEMSELVES = "register read_columns FitProblem Columns after read_arrays stated_unit measured_components"
 
 
 ROOT = Path(__file__).parents[1]

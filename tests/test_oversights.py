@@ -228,7 +228,7 @@ def test_nothing_is_told_under_transformations():
 
 def test_the_shell_prints_a_warning_in_a_line(tmp_path):
     """Of overlapping tables too; what is refused afterwards still has one line of its own."""
-    twice = SCENE[SCENE.index("[[particles]]") : SCENE.index("[run]")]
+    twice = SCENE[SCENE.index("[[particles]]") : SCENE.index("[output]")]
     scene = tmp_path / "scene.toml"
     scene.write_text(SCENE.replace("[run]", f"{twice}[run]").replace("[-0.2, 0.0]", "[-0.2, 0.25]"))
     with pytest.warns(

@@ -44,7 +44,7 @@ def test_quick_start_runs_as_written_and_ends_in_a_gradient(tmp_path):
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
     assert abs(float(ran.stdout) + 6.18e-7) < 0.03e-7
-    assert (tmp_path / "jelly.h5").exists()
+    assert (tmp_path / "jelly.vtkhdf").exists()
 
 
 def test_scene_files_documentation_names_every_class_and_key():

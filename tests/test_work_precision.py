@@ -13,7 +13,7 @@ import mpmjax as mpm
 from mpmjax.analysis import Trial, WorkPrecision
 from mpmjax.analysis._bench import FRAMES, Bench, Timed, settle
 from mpmjax.verification import StandingWave, discretise
-from mpmjax.viz._render import draw_chart, write_trials
+from mpmjax.viz import draw_chart, write_trials
 
 WAVE = StandingWave(0.05)
 

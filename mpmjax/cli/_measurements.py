@@ -172,7 +172,7 @@ def _shown(made: Any, m: Measurement, keys: dict[str, Any]) -> Any:
     if "displacement" in keys:
         x = named(keys["displacement"], float(m.length_unit), "m")
         rows = Columns(m.folder / m.data, keys["displacement"])[keys["displacement"]]
-        path = tuple(made.times.tolist()), tuple(rows.tolist())
+        path = np.stack([made.times, rows])
     else:
         x = keys["stretch"] if "stretch" in keys else named(m.time, x_unit, "s")
     columns = tuple(heads) if made.data.shape[1:] == (len(heads),) else ()

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import canonical, checked, require, require_fields, require_positive
+from mpmjax.checks import as_floats, canonical, checked, require, require_fields, require_finite, require_positive
 from mpmjax.simulation import Run, number_of_steps, simulate
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit
@@ -25,15 +25,24 @@ class Shown(eqx.Module):
         columns: names of the data's components, for the legend.
         x_unit: what one of the abscissa's unit is [SI].
         unit: what one of the data's unit is [SI]; negative where the file counts the other way.
-        path: times [s] and the abscissa at these, in its unit, of data that were not measured against time.
+        path: times [s] and the abscissa at these, in its unit, of data that were not measured against time, shape
+            (2, m).
     """
 
     x: str = eqx.field(static=True, default="")
     y: str = eqx.field(static=True, default="")
     columns: tuple[str, ...] = eqx.field(static=True, default=())
-    x_unit: float = eqx.field(static=True, default=1.0)
-    unit: float = eqx.field(static=True, default=1.0)
-    path: tuple[tuple[float, ...], tuple[float, ...]] | None = eqx.field(static=True, default=None)
+    x_unit: Scalar = eqx.field(converter=as_floats, default=1.0)
+    unit: Scalar = eqx.field(converter=as_floats, default=1.0)
+    path: Float[np.ndarray, "2 m"] | None = eqx.field(converter=as_floats, default=None)
+
+    def __check_init__(self):
+        require_fields(self)
+        require_finite("Shown's unit", self.unit)
+        require(np.asarray(self.unit) != 0, "Shown's unit must not be zero, got 0: give what one of it is in SI units.")
+        require_positive("Shown's x_unit", self.x_unit)
+        if self.path is not None:
+            require_finite("Shown's path", self.path)
 
     def along(self, x: np.ndarray) -> np.ndarray:
         """The abscissae of pictures, from those of the observation."""

@@ -151,6 +151,7 @@ def record(
                     if progress and bar.desc:  # the first steps compile, which says nothing of the time left
                         bar.set_description(refresh=False)
                         bar.initial, bar.start_t = step, time.time()
+                        bar.last_print_t = bar.start_t  # or a bar that ends soon is taken for one never shown
                     bar.update(count)
         run = run_to(problem, state, step, statistics)
         try:

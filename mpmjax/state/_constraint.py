@@ -37,7 +37,7 @@ class AbstractLayerImage(AbstractImage):
 
 class AbstractConstraint(eqx.Module):
     """A constraint on how one body moves, a part of every step, solve and derivative: a linear map of the body's nodes,
-    as a mirror is (see `mpmjax.extensions.Rigid`). The law brings it, by its method `constraint`."""
+    as a mirror is (see `Rigid`). The law brings it, by its method `constraint`."""
 
     number: eqx.AbstractVar[int]
     """Index of the body's material in the scene."""
