@@ -3,8 +3,8 @@
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
-from functools import cache
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -49,21 +49,22 @@ def run_scene(
     done = standing_in(output)[1] if resume else 0
     if not resume:
         check_place(output, overwrite=overwrite)
-    started, compiled = time.perf_counter(), _compilation()
+    started = time.perf_counter()
     simulation = _chosen(path, most_seconds, changes, quiet=quiet)
-    begun, before = time.perf_counter(), compiled[0]
-    run = record(
-        output,
-        simulation.scene,
-        simulation.particles,
-        **simulation.settings,
-        **simulation.output,
-        overwrite=overwrite,
-        resume=resume,
-        progress=not quiet,
-    )
+    begun = time.perf_counter()
+    with _compilation() as compiled:
+        run = record(
+            output,
+            simulation.scene,
+            simulation.particles,
+            **simulation.settings,
+            **simulation.output,
+            overwrite=overwrite,
+            resume=resume,
+            progress=not quiet,
+        )
     taken, seconds = int(run.statistics.steps) - done, time.perf_counter() - begun
-    compiling, frames = min(compiled[0] - before, seconds), standing_in(output)[0]
+    compiling, frames = min(compiled[0], seconds), standing_in(output)[0]
     with reporting(lambda: f"{output} is complete."):
         print(_summary(simulation.particles, run, taken, seconds))
         bound = float(stable_dt(run.scene, run.final, method=run.method)) if taken else np.inf
@@ -76,16 +77,19 @@ def run_scene(
     print(f"written            {output} ({_bytes(output.stat().st_size)}) {reached}".rstrip())
 
 
-@cache
-def _compilation() -> list[float]:
-    """The seconds that XLA has compiled in this process since the first call."""
+@contextmanager
+def _compilation() -> Iterator[list[float]]:
+    """The seconds that XLA has compiled in this process since the block began."""
     spent = [0.0]
 
     def add(event: str, duration_secs: float, **_: Any) -> None:
         spent[0] += duration_secs if event.endswith("backend_compile_duration") else 0.0
 
     jax.monitoring.register_event_duration_secs_listener(add)
-    return spent
+    try:
+        yield spent
+    finally:
+        jax.monitoring.unregister_event_duration_listener(add)
 
 
 def _chosen(scene: Path, most_seconds: float | None, changes: Sequence[str] = (), *, quiet: bool = False) -> Simulation:
