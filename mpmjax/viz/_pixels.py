@@ -53,7 +53,7 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, fps: int) -> None:
 
 def disks(size: tuple[int, int], place: np.ndarray, radius: np.ndarray, colour: np.ndarray) -> np.ndarray:
     """A picture (h, w, 4) of disks, the later ones over the earlier ones, with smooth edges: it is drawn twice as
-    large. matplotlib draws each as a path, which takes twice as long.
+    large.
 
     Args:
         size: w and h [pixels].
