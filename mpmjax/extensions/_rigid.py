@@ -89,7 +89,7 @@ class RigidImage(AbstractLayerImage):
         layer = self.own(field)
         return self.with_own(field, layer[0] + spinning(self.spin(layer[1]), self.arms))
 
-    def places(self, carrier: NodeVector) -> NodeVector:
+    def places(self, carrier: NodeVector) -> Float[Array, "m d"]:
         """The velocity of the centre."""
         return jnp.broadcast_to(self.own(carrier)[0], self.arms.shape)
 

@@ -30,7 +30,7 @@ class AbstractLayerImage(AbstractImage):
         return field.reshape(self.layers, *layer.shape).at[self.layer].set(layer).reshape(field.shape)
 
     @abc.abstractmethod
-    def places(self, carrier: NodeVector) -> NodeVector:
+    def places(self, carrier: NodeVector) -> Float[Array, "m d"]:
         """The velocity [m/s], shape (m, d), of the places at which the impulses on its nodes are taken, by the folded
         velocity of all nodes; `AbstractConstraint.received` gives the couple about them."""
 
