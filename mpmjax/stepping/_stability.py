@@ -262,7 +262,7 @@ def _steepness(scene: Scene, stencil: Stencil) -> tuple[Array, Array]:
         raise UnknownBoundError(f"{type(culprit).__name__} gives no bound on the step: give dt.")
     if stencil.radius is None:
         return bounds
-    # a hoop alone has 1/r² < a; before the mirror at the axis, where it strains with ∂u_r/∂r, it adds 1/(D + r²) to a, Ξ
+    # a hoop alone has 1/r² < a; before the mirror at the axis, where it strains with ∂u_r/∂r, it adds 1/(D + r²)
     near = stencil.radius < (scene.kernel.order - 1) / 2 * spacing
     hoop = jnp.where(near, 1 / (1 / inverse_moment + stencil.radius**2), 0)
     steeper = scene.transfer.steepness(inverse_moment + hoop, bound + hoop)
