@@ -234,7 +234,8 @@ def valid(value, schema, defs):
     if isinstance(value, dict) and "properties" in schema:
         known = schema["properties"]
         inside = all(valid(v, known[k], defs) for k, v in value.items() if k in known)
-        return inside and set(schema["required"]) <= set(value) <= set(known)
+        others = set() if schema.get("additionalProperties", True) is False else set(value) - set(known)
+        return inside and set(schema["required"]) <= set(value) <= set(known) | others
     if isinstance(value, list) and "items" in schema:
         return all(valid(v, schema["items"], defs) for v in value)
     fits = value == schema.get("const", value) and value in schema.get("enum", [value])

@@ -647,6 +647,29 @@ def test_fits_with_new_data_do_not_compile_anew():
     assert iterate_alone._cached._cache_size() == known
 
 
+class Scaled(eqx.Module):
+    """The place of a particle in units of its own, of which a fit may find the size."""
+
+    unit: jnp.ndarray
+
+    def __call__(self, scene, particles):
+        return particles.x[0] / self.unit
+
+
+def test_numbers_of_observations_have_derivatives_in_a_program_of_their_own():
+    """Beside one of the scene, as when both are in one program."""
+    times, x, _ = tracks()
+    seen = mpm.Series(times, x[:, 0], Scaled(jnp.asarray(1.1)), sigma=NOISE)
+    of = {"E": STIFFNESS, "unit": mpm.Positive(lambda e: e.observations[0].of.unit)}
+    whole = [FitProblem(experiment(seen), of, memory) for memory in (2**28, 1)]
+    z, sigmas = jnp.array([0.05, -0.1]), (jnp.asarray(NOISE),)
+    (r, J), (expected, by_each) = (jacobian(problem, z, sigmas) for problem in whole)
+    assert [parts_kept(problem, 3) is None for problem in whole] == [False, True]
+    np.testing.assert_allclose(r, expected, rtol=1e-9)
+    np.testing.assert_allclose(J, by_each, rtol=1e-9, atol=1e-9 * np.abs(by_each).max())
+    assert (np.abs(J).max(axis=0) > 0).all()
+
+
 def test_a_new_observation_leaves_the_program_of_the_run_as_it_is():
     """Another function, and other parameters, of one scene; the numbers are those of observations that are a part of
     the run's program, as where memory has no room for states."""

@@ -253,7 +253,7 @@ def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
         one = (
             f"the name of a [material.NAME], {', '.join(scene.names)}, or its number"
             if scene.names
-            else (f"the number of a [[material]], from 1 to {len(scene.laws)}")
+            else f"the number of a [[material]], from 1 to {len(scene.laws)}"
         )
         require(
             type(material) is int and material in range(1, len(scene.laws) + 1),

@@ -56,7 +56,7 @@ def cuda_library() -> Library:
 
 def _loaded(path: Path, absence: Callable[[ctypes.CDLL], str], kernels: Sequence[str], platform: str) -> Library:
     if not path.is_file():
-        return Library(None, "it was not built: the installation found no C++ compiler that it could use")
+        return Library(None, "it is not in this installation: it is built from source, where there is a C++ compiler")
     try:
         handle = ctypes.CDLL(str(path))
         if (interface := handle.mpmjax_interface()) != INTERFACE:

@@ -202,8 +202,9 @@ class Scene(eqx.Module):
         require_finite("gravity", self.gravity)
         require(len(self.laws) > 0, "A scene needs at least one law, got none.")
         require(
-            len(set(self.names)) in (0, len(self.laws)),
-            f"The names must be one for each of the scene's {len(self.laws)} materials, or none, got {self.names}.",
+            len(set(self.names)) == len(self.names) and len(self.names) in (0, len(self.laws)),
+            f"The names must be one for each of the scene's {len(self.laws)} materials and differ, or none, got "
+            f"{self.names}.",
         )
         require(
             not self.boundary_forces or len(self.boundary) + len(self.guides) > 0,
