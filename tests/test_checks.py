@@ -196,3 +196,9 @@ def test_what_lies_beyond_a_plane_is_told_of_the_plane():
     thrown = eqx.tree_at(lambda q: q.v, particles, jnp.full(particles.v.shape, -1e3))
     with pytest.raises(mpm.SimulationError, match=r"passed boundary 0, SymmetryPlane.* [Rr]educe dt"):
         mpm.simulate(scene, thrown, t1=1e-3, dt=1e-3)
+
+
+@pytest.mark.parametrize("names", [("a", "a"), ("a", "b")])
+def test_names_of_materials_are_one_for_each(names):
+    with pytest.raises(ValueError, match="one for each of the scene's 1 materials and differ"):
+        mpm.Scene(mpm.Grid((8, 8), 0.1), mpm.NeoHookean(1e4, 0.3), names=names)
