@@ -23,19 +23,23 @@ from typing import TYPE_CHECKING, Annotated
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from typing_extensions import TypeAliasType
 
 if TYPE_CHECKING:  # a static checker need not follow NumPy arrays into JAX expressions, which take them
     Scalar = float | Array
     PerParticle = float | Array
-else:
-    Scalar = float | int | Float[Array, ""] | Float[np.ndarray, ""] | np.floating | np.integer
+    Point = tuple[float | int | Array, ...] | list[float | int] | Float[Array, "d"] | Float[np.ndarray, "d"]
+else:  # aliases with names, which signatures show in place of their members
+    _Number = float | int | np.floating | np.integer
+    Scalar = TypeAliasType("Scalar", _Number | Float[Array, ""] | Float[np.ndarray, ""])
     """A number, or an array without axes."""
 
-    PerParticle = float | int | Float[Array, "*#p"] | Float[np.ndarray, "*#p"] | np.floating | np.integer
+    PerParticle = TypeAliasType("PerParticle", _Number | Float[Array, "*#p"] | Float[np.ndarray, "*#p"])
     """One value for all particles, or one for each."""
 
-Point = tuple[float | int | Array, ...] | list[float | int] | Float[Array, "d"] | Float[np.ndarray, "d"]
-"""A point or vector of d numbers."""
+    _Components = tuple[float | int | Array, ...] | list[float | int]
+    Point = TypeAliasType("Point", _Components | Float[Array, "d"] | Float[np.ndarray, "d"])
+    """A point or vector of d numbers."""
 
 
 class MayBeInfinite:

@@ -91,7 +91,8 @@ def require_kind(name: str, value: Any, hint: Any) -> None:
 
 
 def alternatives(hint: Any) -> list[Any]:
-    """The members of a union; of any other annotation, the annotation alone. Marks are left out."""
+    """The members of a union; of any other annotation, the annotation alone. Marks and aliases' names are left out."""
+    hint = getattr(hint, "__value__", hint)
     if get_origin(hint) is Annotated:
         return alternatives(get_args(hint)[0])
     if get_origin(hint) in (typing.Union, UnionType):
@@ -101,6 +102,7 @@ def alternatives(hint: Any) -> list[Any]:
 
 def may_be_infinite(hint: Any) -> bool:
     """Whether an annotation is marked as one of numbers that may be infinite, or a member of its union is."""
+    hint = getattr(hint, "__value__", hint)
     if get_origin(hint) is Annotated:
         inner, *marks = get_args(hint)
         return MayBeInfinite in marks or may_be_infinite(inner)
@@ -134,6 +136,7 @@ def shape_of(value: Any) -> Any:
 
 def _takes(hint: Any, value: Any) -> bool:
     """Whether a value is of a kind that an annotation names; True if that cannot be told."""
+    hint = getattr(hint, "__value__", hint)
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return _takes(args[0], value)

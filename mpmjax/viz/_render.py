@@ -246,10 +246,6 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
         axis.labelpad = 25 * away - 21
         axis.set_major_locator(ticker.MaxNLocator(max(2, round(5 * side))))  # labels of a short side would overlap
     title = axes.set_title(" ")
-    if bar is not None:
-        figure.colorbar(bar, cax=figure.add_axes((0.88, 0.1, 0.018, 0.78)), label=label)
-    else:
-        _legend(axes, run.scene)
     azimuth, elevation = np.radians(view)
     right = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     ends = np.stack([(lower + upper) / 2 - right * size, (lower + upper) / 2 + right * size])
@@ -263,6 +259,13 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
         pixels = axes.transData.transform(np.stack([across, along], axis=1))
         return np.stack([pixels[:, 0], figure.bbox.height - pixels[:, 1]], axis=1), np.asarray(depth)
 
+    if bar is not None:  # as high as the box of the axes is on paper
+        corners = np.stack(np.meshgrid(*np.stack([lower, upper], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
+        heights = 1 - on_paper(corners)[0][:, 1] / figure.bbox.height
+        place = (0.88, heights.min(), 0.018, np.ptp(heights))
+        figure.colorbar(bar, cax=figure.add_axes(place), label=label)
+    else:
+        _legend(axes, run.scene)
     back = np.array([np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
     light = 0.55 * back - 0.45 * right + np.array([0, 0, 0.7])  # from the upper left
     light = light / np.linalg.norm(light)
