@@ -1,5 +1,6 @@
 """Fits: parameters, observations, errors, and what is refused."""
 
+import html
 from unittest.mock import Mock
 
 import equinox as eqx
@@ -55,6 +56,12 @@ def both():
     seen = mpm.Tracks(times, x, which=which, sigma=NOISE)
     shear = {"mu": lambda e: e.scene.material.shear_modulus}
     return mpm.fit(experiment(seen, n=2), {"E": STIFFNESS, "nu": RATIO}, report=shear)
+
+
+def test_notebooks_show_the_table_and_the_picture_of_a_fit(both):
+    shown = both._repr_html_()
+    assert html.escape(str(both)) in shown
+    assert "data:image/png;base64,iVBOR" in shown
 
 
 def test_an_energy_as_analysis_says_it_is_an_observation():

@@ -309,3 +309,19 @@ def test_what_cannot_be_drawn_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no frames"):
         mpm.render(eqx.tree_at(lambda r: r.frames, run, None), path)
     assert not path.exists()
+
+
+def test_notebooks_show_a_runs_last_frame_and_what_a_scene_contains():
+    run = still_run(np.zeros((2, 1, 2)), volume=0.3, gravity=(0.0, -9.8))
+    assert run._repr_html_().startswith('<img src="data:image/png;base64,iVBOR')
+    assert "1 of 0.5 s, 2 frames" in run._repr_html_()
+    alone = dataclasses.replace(run, frames=None)
+    assert "<img" not in alone._repr_html_()
+    failed = eqx.tree_at(lambda r: r.statistics.fault, alone, jnp.asarray(2))
+    assert "OUTSIDE" in failed._repr_html_()
+    several = eqx.tree_at(lambda r: r.final_step, run, jnp.zeros(3))
+    assert "(3,)" in several._repr_html_()
+    shown = run.scene._repr_html_()
+    assert "youngs_modulus=" in shown
+    assert "-9.8" in shown
+    assert "loads" not in shown
