@@ -250,6 +250,11 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
     right = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     ends = np.stack([(lower + upper) / 2 - right * size, (lower + upper) / 2 + right * size])
     figure.canvas.draw()
+    taken: list[Any] = []  # where two axes meet, a label that would lie over another one is left out
+    for tick in (tick for axis in (axes.xaxis, axes.yaxis, axes.zaxis) for tick in axis.majorTicks):
+        box = tick.label1.get_window_extent()
+        tick.label1.set_visible(not any(box.overlaps(other) for other in taken))
+        taken += [box] * tick.label1.get_visible()
     over: Any = figure.add_axes((0, 0, 1, 1), zorder=4)  # the particles' pixels
     over.axis("off")
 
@@ -344,8 +349,9 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
         place = skin(distance, lower - extent / 2, upper + extent / 2, extent / 50)[0]
         lower = np.minimum(lower, place.min(axis=0, initial=np.inf) - 0.03 * extent)
         upper = np.maximum(upper, place.max(axis=0, initial=-np.inf) + 0.03 * extent)
-    shape = 2.0 if d == 1 else float(np.clip((upper - lower)[0] / (upper - lower)[1], 0.5, 2.0))
-    figure = plt.figure(figsize=(4.2 * shape + 1.6, 4.8), layout="constrained")
+    ratio = 2.0 if d == 1 else float((upper - lower)[0] / (upper - lower)[1])
+    wide = 4.2 * np.clip(ratio, 0.5, 2.0)
+    figure = plt.figure(figsize=(wide + 1.6, np.clip(wide / ratio, 1.6, 4.2) + 0.6), layout="constrained")
     axes: Any = figure.add_subplot()
     axes.set(xlabel="r [m]" if grid.axisymmetric else "x [m]", xlim=(lower[0], upper[0]))
     axes.set(
