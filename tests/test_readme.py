@@ -1,5 +1,6 @@
 """The README and the documentation say what happens: links lead somewhere, snippets run, equations exist."""
 
+import ast
 import dataclasses
 import re
 import subprocess
@@ -17,7 +18,7 @@ PAGES = {p.relative_to(ROOT).as_posix(): p for p in (*ROOT.glob("*.md"), *ROOT.g
 SNIPPET = re.compile(r"^( *)```python\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
 """A block of Python: every one runs as it stands."""
 TOML = re.compile(r"```toml\n(.*?)```", re.DOTALL)
-CONTINUED = {"docs/features.md": "README.md"}
+CONTINUED = {"docs/features.md": "README.md", "docs/fitting.md": "docs/tutorial_fit.md"}
 """Pages whose snippets continue those of another page, as they say."""
 
 
@@ -100,7 +101,7 @@ def test_every_block_of_python_is_one_that_runs():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("page", [page for page in PAGES if page != "README.md" and snippets(page)])
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in CONTINUED.values() and snippets(page)])
 def test_the_snippets_of_a_page_run_in_their_order(page, tmp_path):
     """As one program, in an empty folder beside the examples; a TOML block with laws then names what is there."""
     (tmp_path / "examples").symlink_to(ROOT / "examples")
@@ -114,7 +115,7 @@ def test_the_snippets_of_a_page_run_in_their_order(page, tmp_path):
 
 
 def test_toml_blocks_say_what_files_can_say():
-    """Those of docs/fitting.md stand in examples/rubber.toml, that of docs/extending.md names a law which its snippets
+    """Those of docs/tutorial_fit.md stand in examples/rubber.toml, that of docs/extending.md names a law which its snippets
     register; no page has others."""
 
     def within(part, whole):
@@ -125,10 +126,10 @@ def test_toml_blocks_say_what_files_can_say():
 
     tables = {page: list(map(tomllib.loads, TOML.findall(p.read_text("utf-8")))) for page, p in PAGES.items()}
     example = tomllib.loads((ROOT / "examples/rubber.toml").read_text(encoding="utf-8"))
-    assert all(within(table, example) for table in tables["docs/fitting.md"])
+    assert all(within(table, example) for table in tables["docs/tutorial_fit.md"])
     laws = [f"class {table['material']['kind']}(" for table in tables["docs/extending.md"]]
     assert all(any(law in code for code in snippets("docs/extending.md")) for law in laws)
-    assert {page: len(each) for page, each in tables.items() if each} == {"docs/fitting.md": 2, "docs/extending.md": 1}
+    assert {page: len(each) for page, each in tables.items() if each} == {"docs/tutorial_fit.md": 2, "docs/extending.md": 1}
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -152,3 +153,21 @@ def test_the_page_of_a_step_names_files_and_functions_that_exist():
         source = (ROOT / "mpmjax" / path).read_text(encoding="utf-8")
         for name in re.findall(r"`(\w+)`", functions):
             assert re.search(rf"(def|class) {name}\b", source), f"{name} is not in {path}"
+
+
+def test_messages_that_are_explained_are_said():
+    """Each that docs/faq.md quotes stands in a string of the package."""
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in ROOT.glob("mpmjax/**/*.py"))
+    nodes = (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant))
+    texts = [" ".join(node.value.split()) for node in nodes if isinstance(node.value, str)]
+    quoted = re.findall(r'\*\*"(.*?)"\*\*', " ".join(PAGES["docs/faq.md"].read_text(encoding="utf-8").split()))
+    assert len(quoted) > 10
+    assert not [text for text in quoted if not any(text in each for each in texts)]
+
+
+def test_tests_that_the_parity_page_names_exist():
+    """Those in the last column of its table."""
+    rows = re.findall(r"^\|.*\| (`[^|]*`) \|$", PAGES["docs/parity.md"].read_text(encoding="utf-8"), re.MULTILINE)
+    names = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    assert len(names) > 20
+    assert not {name for name in names if not (ROOT / "tests" / f"test_{name}.py").exists()}
