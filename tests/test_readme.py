@@ -18,7 +18,11 @@ PAGES = {p.relative_to(ROOT).as_posix(): p for p in (*ROOT.glob("*.md"), *ROOT.g
 SNIPPET = re.compile(r"^( *)```python\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
 """A block of Python: every one runs as it stands."""
 TOML = re.compile(r"```toml\n(.*?)```", re.DOTALL)
-CONTINUED = {"docs/features.md": "README.md", "docs/fitting.md": "docs/tutorial_fit.md"}
+CONTINUED = {
+    "docs/features.md": "README.md",
+    "docs/fitting.md": "docs/tutorial_fit.md",
+    "docs/notes/file_format.md": "docs/scene_files.md",
+}
 """Pages whose snippets continue those of another page, as they say."""
 
 

@@ -46,7 +46,7 @@ def render(
     """Draw a run: one frame as a still (.png, .pdf, .svg) or all of them as a film (.gif, or .mp4 where ffmpeg is).
 
     In two dimensions particles are squares of their undeformed volume that deform with them and so fill the body; where
-    a law yields, F has lost the shape, and they are half as large again. Walls are lines. In three they are balls
+    a law yields or flows, F has lost the shape, and they are twice as wide. Walls are lines. In three they are balls
     sorted by depth, half as large again, so that they close into a body, and shaded by its surface in a light from the
     upper left; up is against gravity's largest component (the last axis without gravity), and the ground is the highest
     wall or plane that bears, else a little below the particles. All frames of a run have the same view and scale.
@@ -381,7 +381,7 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
         for rows, stored, history in by_material(particles):
             a = np.asarray(stored)
             F[rows, :d, :d] = a[:, :d, :d] if a.ndim == 3 else a[:, None, None] ** (1 / d) * np.eye(d)
-            F[rows] *= 1.0 if history is None else 1.5
+            F[rows] *= 2.0 if a.ndim == 1 or history is not None else 1.0  # F does not say how they are stretched
         square, colours = place[:, None] + np.einsum("pij,pkj->pki", F, corners), _tinted(particles, bar, values)
         squares.set_verts(whole(square))
         squares.set_facecolor(np.concatenate([colours, colours]) if grid.axisymmetric else colours)
