@@ -119,8 +119,8 @@ def test_the_snippets_of_a_page_run_in_their_order(page, tmp_path):
 
 
 def test_toml_blocks_say_what_files_can_say():
-    """Those of docs/tutorial_fit.md stand in examples/rubber.toml, that of docs/extending.md names a law which its snippets
-    register; no page has others."""
+    """Those of the tutorial of fits stand in examples/rubber.toml, that of docs/extending.md names a law which its
+    snippets register; no page has others."""
 
     def within(part, whole):
         if isinstance(part, dict):
@@ -133,7 +133,8 @@ def test_toml_blocks_say_what_files_can_say():
     assert all(within(table, example) for table in tables["docs/tutorial_fit.md"])
     laws = [f"class {table['material']['kind']}(" for table in tables["docs/extending.md"]]
     assert all(any(law in code for code in snippets("docs/extending.md")) for law in laws)
-    assert {page: len(each) for page, each in tables.items() if each} == {"docs/tutorial_fit.md": 2, "docs/extending.md": 1}
+    counts = {page: len(each) for page, each in tables.items() if each}
+    assert counts == {"docs/tutorial_fit.md": 2, "docs/extending.md": 1}
 
 
 @pytest.mark.parametrize("page", PAGES)
