@@ -5,22 +5,21 @@ What a first scene and a first fit need is here. Solvers and preconditioners are
 docs/features.md lists every name.
 """
 
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+
 from mpmjax import (
-    analysis as analysis,
     boundary as boundary,
     discretisation as discretisation,
     extensions as extensions,
-    fitting as fitting,
     geometry as geometry,
     implicit as implicit,
     linalg as linalg,
     material as material,
     native as native,
-    simulation as simulation,
     state as state,
     stepping as stepping,
 )
-from mpmjax.analysis import budget as budget, energy as energy, momentum as momentum, stress as stress
 from mpmjax.boundary import (
     ContactPlane as ContactPlane,
     Grip as Grip,
@@ -33,7 +32,6 @@ from mpmjax.boundary import (
     StickyCollider as StickyCollider,
     SymmetryPlane as SymmetryPlane,
 )
-from mpmjax.cli import load_scene as load_scene
 from mpmjax.discretisation import (
     APIC as APIC,
     FLIP as FLIP,
@@ -44,16 +42,6 @@ from mpmjax.discretisation import (
     SplineGradient as SplineGradient,
 )
 from mpmjax.extensions import Rigid as Rigid
-from mpmjax.fitting import (
-    Bounded as Bounded,
-    Curve as Curve,
-    Experiment as Experiment,
-    Positive as Positive,
-    Series as Series,
-    Tracks as Tracks,
-    Unbounded as Unbounded,
-    fit as fit,
-)
 from mpmjax.geometry import (
     Ball as Ball,
     Box as Box,
@@ -62,7 +50,6 @@ from mpmjax.geometry import (
     RigidMotion as RigidMotion,
     TimeSeries as TimeSeries,
 )
-from mpmjax.io import load as load, record as record, register as register, save as save, table as table
 from mpmjax.material import (
     AbstractMaterial as AbstractMaterial,
     CamClay as CamClay,
@@ -79,12 +66,6 @@ from mpmjax.material import (
     Viscous as Viscous,
     VonMises as VonMises,
     Yeoh as Yeoh,
-)
-from mpmjax.simulation import (
-    Run as Run,
-    SimulationError as SimulationError,
-    rollout as rollout,
-    simulate as simulate,
 )
 from mpmjax.state import (
     AveragedVolume as AveragedVolume,
@@ -115,6 +96,57 @@ from mpmjax.stepping import (
     stable_dt as stable_dt,
     step as step,
 )
-from mpmjax.viz import render as render
 
 __version__ = "0.1.0"
+
+_LATE = {
+    "analysis": "budget energy momentum stress",
+    "cli": "load_scene",
+    "fitting": "Bounded Curve Experiment Positive Series Tracks Unbounded fit",
+    "io": "load record register save table",
+    "simulation": "Run SimulationError rollout simulate",
+    "viz": "render",
+}
+"""The rooms that no step needs, and their names here. They load, with diffrax, optax and more, when first used."""
+
+if TYPE_CHECKING:
+    from mpmjax import (
+        analysis as analysis,
+        cli as cli,
+        fitting as fitting,
+        io as io,
+        simulation as simulation,
+        viz as viz,
+    )
+    from mpmjax.analysis import budget as budget, energy as energy, momentum as momentum, stress as stress
+    from mpmjax.cli import load_scene as load_scene
+    from mpmjax.fitting import (
+        Bounded as Bounded,
+        Curve as Curve,
+        Experiment as Experiment,
+        Positive as Positive,
+        Series as Series,
+        Tracks as Tracks,
+        Unbounded as Unbounded,
+        fit as fit,
+    )
+    from mpmjax.io import load as load, record as record, register as register, save as save, table as table
+    from mpmjax.simulation import (
+        Run as Run,
+        SimulationError as SimulationError,
+        rollout as rollout,
+        simulate as simulate,
+    )
+    from mpmjax.viz import render as render
+else:
+
+    def __getattr__(name: str):
+        room = next((room for room, names in _LATE.items() if name in (room, *names.split())), None)
+        if room is None:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module = _import_module(f"{__name__}.{room}")
+        globals()[name] = module if name == room else getattr(module, name)
+        return globals()[name]
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *_LATE, *" ".join(_LATE.values()).split()})

@@ -30,8 +30,10 @@ BY_THEMSELVES = "register read_columns FitProblem Columns after read_arrays stat
 
 
 ROOT = Path(__file__).parents[1]
-TOP = {name: thing for name, thing in vars(mpm).items() if name[0] != "_" and not inspect.ismodule(thing)}
-FITTING = {name: thing for name, thing in vars(mpm.fitting).items() if name[0] != "_" and not inspect.ismodule(thing)}
+TOP, FITTING = (
+    {name: thing for name in dir(room) if name[0] != "_" and not inspect.ismodule(thing := getattr(room, name))}
+    for room in (mpm, mpm.fitting)
+)
 LISTED = re.findall(r"`([a-z]+)\.(\w+)", (ROOT / "docs" / "features.md").read_text(encoding="utf-8"))
 """Names of sub-packages that the features tell users of."""
 IN_ROOMS = {name: getattr(getattr(mpm, room), name) for room, name in LISTED if hasattr(mpm, room)}
