@@ -5,6 +5,7 @@ What a first scene and a first fit need is here. Solvers and preconditioners are
 docs/features.md lists every name.
 """
 
+import sys as _sys
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 
@@ -150,3 +151,7 @@ else:
 
     def __dir__() -> list[str]:
         return sorted({*globals(), *_LATE, *" ".join(_LATE.values()).split()})
+
+
+    if {"IPython", "marimo"} & _sys.modules.keys():  # notebooks show scenes, runs and fits by what this adds to them
+        _import_module(f"{__name__}.viz")

@@ -3,8 +3,10 @@
 import ast
 import importlib
 import inspect
+import itertools
 import pkgutil
 import re
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,31 @@ def undocumented(module):
 def test_every_public_name_says_what_it_is(name):
     """In its own docstring or, of a method that overrides another, in that of a base class."""
     assert not list(undocumented(importlib.import_module(name)))
+
+
+def explained(cls):
+    """The fields that the class explains: in its docstring, in one of their own, or by a comment behind them."""
+    source = textwrap.dedent(inspect.getsource(cls))
+    body = ast.parse(source).body[0].body
+    told = {
+        a.target.id for a in body if isinstance(a, ast.AnnAssign) and "  # " in source.splitlines()[a.end_lineno - 1]
+    }
+    for field, after in itertools.pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
+            told.add(field.target.id)
+    for names in re.findall(r"^ +(\w+(?:, \w+)*)(?: \(.*?\))?:", cls.__doc__ or "", re.MULTILINE):
+        told |= set(names.split(", "))
+    return told
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if name.count(".") == 1])
+def test_every_field_of_a_public_class_is_explained(name):
+    """By the class or by one that it derives from."""
+    for cls in vars(importlib.import_module(name)).values():
+        if inspect.isclass(cls) and cls.__module__.startswith(name):
+            whole = [base for base in cls.__mro__ if base.__module__.startswith("mpmjax")]
+            fields = getattr(cls, "_fields", ()) or getattr(cls, "__dataclass_fields__", ())
+            assert not {f for f in fields if f[0] != "_"} - set().union(*map(explained, whole)), cls
 
 
 PACKAGE = Path(mpmjax.__file__).parent

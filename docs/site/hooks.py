@@ -25,7 +25,7 @@ REFERENCE = {
 def _exported(room: str) -> list[str]:
     """The public names of a room, by the imports of its `__init__.py`."""
     tree = ast.parse((ROOT / "mpmjax" / room / "__init__.py").read_text(encoding="utf-8"))
-    aliases = [a for node in tree.body if isinstance(node, ast.ImportFrom) for a in node.names]
+    aliases = [a for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for a in node.names]
     return [a.name for a in aliases if a.asname == a.name and not (ROOT / "mpmjax" / a.name).is_dir()]
 
 

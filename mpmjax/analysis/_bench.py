@@ -36,10 +36,10 @@ Build = Callable[[int], tuple[Scene, Particles]]
 class Trial(NamedTuple):
     """A run by a method at a step and spacing, with its seconds and error."""
 
-    method: AbstractIntegrator
+    method: AbstractIntegrator  # the integrator
     refinement: int  # the spacing of the scene over that of the run
     dt: float  # Δt [s]
-    steps: int
+    steps: int  # how many steps the run took
     seconds: float
     """Wall time without compilation [s]: of one run, the faster of two brief ones, or foreseen from fewer steps."""
     error: float  # relative error of the motion; infinite if the run failed, NaN if it was foreseen to take too long

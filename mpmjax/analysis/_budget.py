@@ -16,14 +16,17 @@ from mpmjax.stepping import AbstractIntegrator, Explicit, grid_to_particles, rea
 
 
 class Energy(eqx.Module):
-    """The energy of a state [J] (per metre of thickness in 2-D, per square metre of section in 1-D)."""
+    """The energy of a state [J] (per metre of thickness in 2-D, per square metre of section in 1-D).
+
+    Attributes:
+        kinetic: ½ Σ m (‖v‖² + tr(C D Cᵀ)), with the affine part for APIC; of a rigid body ½ M ‖V‖² + ½ ω·Iω.
+        elastic: Σ V0 Ψ(F), with the elastic law for the present history.
+        potential: −Σ m g·x.
+    """
 
     kinetic: Float[Array, "*f"]
-    """½ Σ m (‖v‖² + tr(C D Cᵀ)), with the affine part for APIC; of a rigid body ½ M ‖V‖² + ½ ω·Iω."""
     elastic: Float[Array, "*f"]
-    """Σ V0 Ψ(F), with the elastic law for the present history."""
     potential: Float[Array, "*f"]
-    """−Σ m g·x."""
 
     @property
     def total(self) -> Float[Array, "*f"]:
@@ -200,8 +203,8 @@ class MomentumBudget(eqx.Module):
 class Budget(eqx.Module):
     """Budgets of energy and momentum for the steps of a run."""
 
-    energy: EnergyBudget
-    momentum: MomentumBudget
+    energy: EnergyBudget  # the energy of each step [J]
+    momentum: MomentumBudget  # the momentum of each step [kg m/s]
 
 
 @checked

@@ -26,7 +26,7 @@ _AS_GOOD = 1.1  # how much larger an error still counts as the same
 class WorkPrecision(NamedTuple):
     """Errors against seconds, and the cheapest setting."""
 
-    trials: tuple[Trial, ...]
+    trials: tuple[Trial, ...]  # all runs, those that failed or were only foreseen too
     reference: Trial
     """The reference run; its error is an estimate."""
     target: float

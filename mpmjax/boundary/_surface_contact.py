@@ -81,7 +81,7 @@ class Faces(eqx.Module):
     inertia: Float[Array, "p"]
     """A α ρ0/dx [kg/m²], shape (p,): times the square of the velocity of approach, the stiffness of contact that a
     shock adds."""
-    stencil: Stencil
+    stencil: Stencil  # the nodes of each particle
     spacing: Scalar
     """dx [m]."""
     dt: Scalar
@@ -176,7 +176,7 @@ class SurfaceContact(AbstractSpringContact):
     stiffness: Float[Array, "s p"]
     velocity: Float[Array, "d p"] | None
     """Velocity of the surface [m/s], shape (d, p); None at rest."""
-    faces: Faces
+    faces: Faces  # the faces that are pushed
     dt: Scalar
     share: Scalar
     coefficient: Scalar

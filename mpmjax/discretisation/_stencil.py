@@ -106,7 +106,7 @@ class Stencil(eqx.Module):
     """Factor of the gradient's polynomials, 1/dx [1/m]."""
     inside: Bool[Array, "p"]
     """Whether the whole stencil of the particle lies in the window."""
-    basis: Basis = eqx.field(static=True)
+    basis: Basis = eqx.field(static=True)  # the polynomials, and the window
     own_derivatives: Float[Array, "d s p"] | None = None
     """The gradient's factors along each axis [1/m], shape (d, s, p), of a gradient operator that is not given by
     polynomials: all sums are then written in JAX. Else None."""

@@ -25,9 +25,9 @@ Sigmas = tuple[Array, ...]  # the noise of each observation, in its data's unit
 class FitProblem(eqx.Module):
     """The residuals of some experiments as a function of the coordinates of some parameters."""
 
-    experiments: tuple[Experiment, ...]
-    names: tuple[str, ...] = eqx.field(static=True)
-    parameters: tuple[AbstractParameter, ...]
+    experiments: tuple[Experiment, ...]  # the experiments, with the first guesses
+    names: tuple[str, ...] = eqx.field(static=True)  # the names of the parameters
+    parameters: tuple[AbstractParameter, ...]  # what is searched
     starts: tuple[Array, ...]  # the first guess of each
     memory: int = eqx.field(static=True, default=2**28)  # memory for what reverse mode stores, and for tangents [B]
 

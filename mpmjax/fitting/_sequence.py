@@ -180,7 +180,7 @@ class RefinedFit(AbstractFit):
     """Estimates from several grids, extrapolated to a spacing of zero: `result["E"]` is that of a parameter."""
 
     fits: tuple[FitResult, ...]  # the fit on each grid, from coarse to fine
-    refinements: tuple[int, ...]
+    refinements: tuple[int, ...]  # the spacing of the scene over that of each fit
     estimates: tuple[Estimate, ...]
     """The extrapolated numbers. Error and interval hold the noise's and the discretisation's part."""
     from_noise: tuple[float, ...]  # the part of each error that the data's noise makes

@@ -39,8 +39,8 @@ class ParticleStiffness(AbstractHessianAction):
     """
 
     upper: Float[Array, "t p"]  # the upper triangle of K_p, row by row, shape (d²(d² + 1)/2, p)
-    stencil: Stencil
-    mirror: Mirror
+    stencil: Stencil  # the nodes of each particle
+    mirror: Mirror  # the planes at which nodes are mirrored
     positive_semidefinite: bool = eqx.field(static=True, default=False)
     """Whether the K_p with `coupled` are known to be positive semi-definite."""
     coupled: tuple[AbstractStiffness, ...] = ()  # the stiffness of materials that couples their particles

@@ -67,7 +67,7 @@ class ImplicitOperator(eqx.Module):
     """χ [s²]."""
     hessian: AbstractHessianAction
     """H [N/m]."""
-    projection: Projection
+    projection: Projection  # Q
     viscosity: tuple[ElasticPotential, Scalar] | None = None
     """The potential whose viscous force −D v is in the equation, and r [1/s]: H is then H + r D. None if there is no
     such force, or if `hessian` has it already."""

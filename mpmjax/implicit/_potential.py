@@ -30,9 +30,9 @@ class ElasticPotential(eqx.Module):
     has, so that the sums over one tuple would be longer than these over two.
     """
 
-    material_points: tuple[MaterialPoints, ...]
-    stencil: Stencil
-    mirror: Mirror
+    material_points: tuple[MaterialPoints, ...]  # the particles of each material
+    stencil: Stencil  # the nodes of each particle
+    mirror: Mirror  # the planes at which nodes are mirrored
     size: int = eqx.field(static=True)
     """Number of nodes n."""
     terms: tuple[AbstractTerm, ...] = ()

@@ -65,7 +65,7 @@ class StageProblem(eqx.Module):
     hessian: AbstractHessian  # H = ∂²Φ/∂u∂u [N/m], exactly or approximately
     projection: Projection  # the projection on free components
     prescribed: NodeVector | None  # the velocity of held components [m/s], shape (n, d); None if they are at rest
-    preconditioner: AbstractPreconditioner
+    preconditioner: AbstractPreconditioner  # W
     theta: Scalar = 1.0  # θ [-], the share of the stage's displacement at which its force is evaluated
     action: AbstractHessianAction | None = None  # H at the start of the step in a linearised problem; None in others
 
@@ -179,7 +179,7 @@ class Reporting(eqx.Module):
     so the sum is the residual of the first.
     """
 
-    solver: lx.AbstractLinearSolver
+    solver: lx.AbstractLinearSolver  # the solver of tangent and adjoint systems
     slot: Scalar  # zero
 
 

@@ -28,7 +28,7 @@ class DeformationMeasure(NamedTuple):
     """How many axes one particle's deformation has: 2 of F, none of J."""
     symbol: str
     """In messages, what is stored; `name` says what it is."""
-    name: str
+    name: str  # in messages, what the symbol stands for
     volume: str
     """In messages, what most laws need to be positive."""
     rate: str

@@ -76,8 +76,8 @@ class Image(AbstractImage):
     """Signed copies of true nodes at their mirror images, along one axis of the window."""
 
     shape: tuple[int, ...] = eqx.field(static=True)  # the grid's shape, of each of its layers
-    layers: int = eqx.field(static=True)
-    axis: int = eqx.field(static=True)
+    layers: int = eqx.field(static=True)  # layers of nodes, one a body
+    axis: int = eqx.field(static=True)  # the plane's normal
     source: Int[Array, "m"]  # the node of which each node along the axis is a copy, shape (m,)
     even: Int[Array, "m"]  # the sign of copies of even fields, 0 where the source is outside of the window, shape (m,)
     odd: Int[Array, "m"]  # the sign of copies of odd fields, 0 on the plane too, shape (m,)
@@ -178,7 +178,7 @@ class Tie(AbstractImage):
 class Mirror(eqx.Module):
     """The mirrors of several planes: `unfold` applies B, from true nodes to all nodes; `fold` applies Bᵀ."""
 
-    images: tuple[AbstractImage | WallImage, ...]
+    images: tuple[AbstractImage | WallImage, ...]  # the images at each plane, in their order
 
     def unfold(self, field: NodeVector) -> NodeVector:
         """B v: fill in the mirror images."""

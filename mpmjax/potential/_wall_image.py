@@ -20,8 +20,8 @@ class WallImage(eqx.Module):
 
     shape: tuple[int, ...] = eqx.field(static=True)
     """The grid's shape, of each of its layers."""
-    layers: int = eqx.field(static=True)
-    axis: int = eqx.field(static=True)
+    layers: int = eqx.field(static=True)  # layers of nodes, one a body
+    axis: int = eqx.field(static=True)  # the wall's normal
     start: Int[Array, ""]
     """The first row's number along the axis."""
     b: Int[Array, ""]

@@ -28,7 +28,7 @@ LEAST_STRETCH = 1e-2  # principal stretch [-] below which a particle has collaps
 class RolloutState(eqx.Module):
     """The part of a rollout that evolves: the particles' state, and what colliders and boundaries have received."""
 
-    particles: State
+    particles: State  # what evolves of the particles
     collider_impulse: Impulses | None = None
     """Linear and angular impulse on the scene's colliders since the rollout began; None without colliders."""
     boundary_impulse: Impulses | None = None
@@ -78,12 +78,12 @@ def _with_transposed_affine(state: State) -> State:
 class Problem(eqx.Module):
     """The part of a rollout that does not evolve."""
 
-    scene: Scene
-    particles: Particles
-    dt: Scalar
-    method: AbstractIntegrator
-    stencil: Stencil | None = None
-    observe: Callable[[Scene, Particles], Any] | None = None
+    scene: Scene  # what does not change
+    particles: Particles  # the particles at the start
+    dt: Scalar  # Δt [s]
+    method: AbstractIntegrator  # the integrator
+    stencil: Stencil | None = None  # in the total description, where it is made once
+    observe: Callable[[Scene, Particles], Any] | None = None  # what is saved of each frame besides its state
     start: Scalar = 0.0  # number of the first step
     until: Scalar = np.inf  # number of steps after which a watched run ends, if it is less than were asked for
     slot: Scalar = 0.0  # zero; adjoint solves report through its cotangent (see `Reporting`)

@@ -34,42 +34,48 @@ class Fault(enum.IntEnum):
 
 
 class RunStatistics(eqx.Module):
-    """Sums over the steps of a run."""
+    """Sums over the steps of a run.
+
+    Attributes:
+        steps: steps taken.
+        iterations: iterations of the linear solver.
+        most_iterations: largest number of iterations in one step.
+        newton: newton steps.
+        line_search: halvings by the line search.
+        worst_residual: largest relative residual at the end of a solve.
+        force_error: largest error of a step's elastic force [N] (see `StepInfo.force_error`).
+        force_scale: largest scale of these forces [N].
+        unconverged: steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a
+            solution.
+        nearly_converged: steps whose solve missed its tolerance, by less than ten times: the run is less accurate than
+            was asked for.
+        indefinite: steps whose solve met negative curvature: compression has made M + χH indefinite, and near a
+            singular one the motion is wrong however small the residual. `AnalyticHessian(projected=True)` or a smaller
+            step avoids it.
+        sweeps: solves for contact beyond one a step.
+        violations: contact conditions left violated, summed over steps.
+        fault: the first `Fault`.
+        fault_step: number of steps that led to it.
+        unmet: with BAD_PARAMETERS the number, from one, of the first of the `requirements` on scene, particles and
+            method that is not met; else zero.
+    """
 
     steps: Int[Array, "*f"]
-    """Steps taken."""
     iterations: Int[Array, "*f"]
-    """Iterations of the linear solver."""
     most_iterations: Int[Array, "*f"]
-    """Largest number of iterations in one step."""
     newton: Int[Array, "*f"]
-    """Newton steps."""
     line_search: Int[Array, "*f"]
-    """Halvings by the line search."""
     worst_residual: Float[Array, "*f"]
-    """Largest relative residual at the end of a solve."""
     force_error: Float[Array, "*f"]
-    """Largest error of a step's elastic force [N] (see `StepInfo.force_error`)."""
     force_scale: Float[Array, "*f"]
-    """Largest scale of these forces [N]."""
     unconverged: Int[Array, "*f"]
-    """Steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a solution."""
     nearly_converged: Int[Array, "*f"]
-    """Steps whose solve missed its tolerance, by less than ten times: the run is less accurate than was asked for."""
     indefinite: Int[Array, "*f"]
-    """Steps whose solve met negative curvature: compression has made M + χH indefinite, and near a singular one the
-    motion is wrong however small the residual. `AnalyticHessian(projected=True)` or a smaller step avoids it."""
     sweeps: Int[Array, "*f"]
-    """Solves for contact beyond one a step."""
     violations: Int[Array, "*f"]
-    """Contact conditions left violated, summed over steps."""
     fault: Int[Array, "*f"]
-    """The first `Fault`."""
     fault_step: Int[Array, "*f"]
-    """Number of steps that led to it."""
     unmet: Int[Array, "*f"]
-    """With BAD_PARAMETERS the number, from one, of the first of the `requirements` on scene, particles and method that
-    is not met; else zero."""
 
     @property
     def linearisation_error(self) -> Float[Array, "*f"]:
@@ -154,41 +160,45 @@ class Forces(NamedTuple):
 
 
 class Run(eqx.Module):
-    """A simulation's outcome. A pytree: it can be returned from `jax.jit`, `jax.vmap` and differentiated."""
+    """A simulation's outcome. A pytree: it can be returned from `jax.jit`, `jax.vmap` and differentiated.
+
+    Attributes:
+        scene: the scene, with numbers as arrays of the particles' precision.
+        method: the integrator, likewise.
+        dt: Δt [s].
+        steps: step number of each saved frame, shape (f,).
+        frames: the saved states, with a leading axis f; None where nothing or only observations were saved.
+        observed: the result of `observe` for each frame, with a leading axis f.
+        final: the particles at the end.
+        final_step: step number at the end.
+        statistics: solver and contact statistics, and the first fault.
+        report: zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not
+            converge, zero if all did. None of a run from a file.
+        collider_impulse: linear and angular impulse on the scene's colliders from the run's start to each saved frame,
+            with a leading axis f; None without colliders, or where nothing was saved. The difference between two
+            frames, over the time between them, is the mean force and torque of these steps (see `forces`, which says at
+            what time).
+        final_collider_impulse: linear and angular impulse on the colliders to the end; None without colliders.
+        boundary_impulse: as `collider_impulse`, on each of the scene's boundaries (see `boundary_forces`); None unless
+            the scene has `boundary_forces`, or where nothing was saved.
+        final_boundary_impulse: impulse on each of the scene's boundaries from the run's start to its end; None unless
+            the scene has `boundary_forces`.
+    """
 
     scene: Scene
-    """The scene, with numbers as arrays of the particles' precision."""
     method: AbstractIntegrator
-    """The integrator, likewise."""
     dt: Scalar
-    """Δt [s]."""
     steps: Float[Array, "*f"]
-    """Step number of each saved frame, shape (f,)."""
     frames: State | None
-    """The saved states, with a leading axis f; None where nothing or only observations were saved."""
     observed: Any
-    """The result of `observe` for each frame, with a leading axis f."""
     final: Particles
-    """The particles at the end."""
     final_step: Float[Array, ""]
-    """Step number at the end."""
     statistics: RunStatistics
-    """Solver and contact statistics, and the first fault."""
     report: Float[Array, "..."] | None = None
-    """Zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not converge, zero
-    if all did. None of a run from a file."""
     collider_impulse: Impulses | None = None
-    """Linear and angular impulse on the scene's colliders from the run's start to each saved frame, with a leading axis
-    f; None without colliders, or where nothing was saved. The difference between two frames, over the time between
-    them, is the mean force and torque of these steps (see `forces`, which says at what time)."""
     final_collider_impulse: Impulses | None = None
-    """Linear and angular impulse on the colliders to the end; None without colliders."""
     boundary_impulse: Impulses | None = None
-    """As `collider_impulse`, on each of the scene's boundaries (see `boundary_forces`); None unless the scene has
-    `boundary_forces`, or where nothing was saved."""
     final_boundary_impulse: Impulses | None = None
-    """Impulse on each of the scene's boundaries from the run's start to its end; None unless the scene has
-    `boundary_forces`."""
 
     @property
     def times(self) -> Float[Array, "*f"]:

@@ -25,29 +25,31 @@ class Particles(eqx.Module):
     Only x, v, C, deformations and histories change with time. Every leaf is a float array of one dtype. Particles of
     several materials lie group after group (see `join`). Deformations and histories have one entry a material, None
     until they are known; `F` and `history` are those of the only material.
+
+    Attributes:
+        x: positions [m], shape (p, d).
+        v: velocities [m/s], shape (p, d).
+        mass: masses [kg], shape (p,).
+        volume: undeformed volumes V0 [m^d], shape (p,).
+        deformations: for each material the deformation gradients F [-], for laws that yield their elastic part, shape
+            (q, d, d); for laws that depend on J = det F only, J, shape (q,).
+        C: velocity gradients ∇_x v [1/s], in the total description ∇_X v, shape (p, d, d): the affine velocities of
+            APIC, and what viscosity resists.
+        X: reference positions [m], shape (p, d), in the total description.
+        histories: for each material the history of a law that yields, a pytree of arrays of shape (q,) each (see the
+            law); else None.
+        counts: number of particles of each of several materials; None if there is one.
     """
 
     x: ParticleVector
-    """Positions [m], shape (p, d)."""
     v: ParticleVector
-    """Velocities [m/s], shape (p, d)."""
     mass: ParticleScalar
-    """Masses [kg], shape (p,)."""
     volume: ParticleScalar
-    """Undeformed volumes V0 [m^d], shape (p,)."""
     deformations: Deformations = ()
-    """For each material the deformation gradients F [-], for laws that yield their elastic part, shape (q, d, d); for
-    laws that depend on J = det F only, J, shape (q,)."""
     C: ParticleMatrix | None = None
-    """Velocity gradients ∇_x v [1/s], in the total description ∇_X v, shape (p, d, d): the affine velocities of APIC,
-    and what viscosity resists."""
     X: ParticleVector | None = None
-    """Reference positions [m], shape (p, d), in the total description."""
     histories: tuple[Any, ...] = ()
-    """For each material the history of a law that yields, a pytree of arrays of shape (q,) each (see the law); else
-    None."""
     counts: tuple[int, ...] | None = eqx.field(static=True, default=None)
-    """Number of particles of each of several materials; None if there is one."""
 
     def __post_init__(self):
         materials = len(self.counts) if isinstance(self.counts, tuple) else 1  # what it is is checked below
@@ -225,11 +227,11 @@ def of_one_material(parts: Sequence[Any]) -> Any:
 class State(eqx.Module):
     """The part of the particles that evolves."""
 
-    x: Float[Array, "*f p d"]
-    v: Float[Array, "*f p d"]
-    C: Float[Array, "*f p d d"] | None
-    deformations: Deformations
-    histories: tuple[Any, ...]
+    x: Float[Array, "*f p d"]  # positions [m], shape (p, d), of a run (f, p, d)
+    v: Float[Array, "*f p d"]  # velocities [m/s], shape (p, d)
+    C: Float[Array, "*f p d d"] | None  # velocity gradients [1/s], shape (p, d, d)
+    deformations: Deformations  # F or J of each material (see `Particles`)
+    histories: tuple[Any, ...]  # what the law of each material remembers
 
     F, history = Particles.F, Particles.history
 

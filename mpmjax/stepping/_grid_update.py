@@ -22,15 +22,15 @@ SWEEPS = 4
 class GridUpdate(eqx.Module):
     """The motion of the nodes over a step, mirrored at active contact planes."""
 
-    motion: NodeMotion
+    motion: NodeMotion  # how the nodes move
     solved: NodeMotion  # `motion` before friction
     elastic: NodeVector | None
     """The impulse of elastic forces (see `AbstractIntegrator.elastic_impulse`) [kg m/s], shape (n, d); None if P2G
     summed momentum and force together."""
-    solve: SolveInfo
+    solve: SolveInfo  # the report of the solve
     constrained: ConstrainedNodes | None = None  # the nodes with the active set held; None in a scene without contact
     friction: tuple[NodeVector, ...] = ()  # the change of velocity by the friction of each contact [m/s], shape (n, d)
-    contact: ContactInfo | None = None
+    contact: ContactInfo | None = None  # the report of contact; None in a scene without it
 
     def held(self, nodes: Nodes) -> ConstrainedNodes:
         """The nodes with what contacts hold."""

@@ -120,8 +120,8 @@ class AbstractProblem(eqx.Module):
 class Manufactured(AbstractBodyForce):
     """The body force of a problem, on particles with known reference positions X [m], shape (p, d)."""
 
-    problem: AbstractProblem
-    X: ParticleVector
+    problem: AbstractProblem  # the problem whose force it is
+    X: ParticleVector  # reference positions [m], shape (p, d)
 
     def acceleration(self, x: ParticleVector, t: Scalar) -> ParticleVector:
         del x
@@ -331,9 +331,9 @@ class Column(AbstractColumn):
     method: ClassVar[AbstractIntegrator] = SemiImplicit()
     load: float = 0.04
     shift: float = 0.0
-    material: AbstractMaterial = FixedCorotated(1.0, 0.0)
-    density: float = 1.0
-    dim: int = eqx.field(static=True, default=1)
+    material: AbstractMaterial = FixedCorotated(1.0, 0.0)  # the law, with ν = 0
+    density: float = 1.0  # ρ0 [kg/m^d]
+    dim: int = eqx.field(static=True, default=1)  # space dimension
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         return X - self.acting(t) * (X - X**2 / 2)
@@ -355,9 +355,9 @@ class HenckyColumn(AbstractColumn):
     method: ClassVar[AbstractIntegrator] = BackwardEuler()
     load: float = 4.0
     shift: float = 0.0
-    material: AbstractMaterial = Hencky(1.0, 0.0)
-    density: float = 1.0
-    dim: int = eqx.field(static=True, default=1)
+    material: AbstractMaterial = Hencky(1.0, 0.0)  # the law, with ν = 0
+    density: float = 1.0  # ρ0 [kg/m^d]
+    dim: int = eqx.field(static=True, default=1)  # space dimension
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         a = self.acting(t)

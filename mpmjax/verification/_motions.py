@@ -71,9 +71,9 @@ class VibratingBar(AbstractProblem):
     speed: float = 0.1
     mode: int = eqx.field(static=True, default=1)
     length: float = eqx.field(static=True, default=25.0)
-    material: AbstractMaterial = FixedCorotated(100.0, 0.0)
-    density: float = 1.0
-    dim: int = eqx.field(static=True, default=1)
+    material: AbstractMaterial = FixedCorotated(100.0, 0.0)  # the law, with ν = 0
+    density: float = 1.0  # ρ0 [kg/m^d]
+    dim: int = eqx.field(static=True, default=1)  # space dimension
 
     @property
     def wave_number(self) -> float:
@@ -123,7 +123,7 @@ class ExpandingRing(AbstractProblem):
     outer: float = 0.6
     material: AbstractMaterial = NeoHookean(1e7, 0.0)
     density: float = 1e3
-    dim: int = eqx.field(static=True, default=2)
+    dim: int = eqx.field(static=True, default=2)  # space dimension
 
     @property
     def duration(self) -> float:
@@ -175,7 +175,7 @@ class Vortex(AbstractProblem):
     amplitude: float = 0.1
     material: AbstractMaterial = NeoHookean(1e3, 0.3)
     density: float = 1e3
-    dim: int = eqx.field(static=True, default=2)
+    dim: int = eqx.field(static=True, default=2)  # space dimension
 
     @property
     def duration(self) -> float:
@@ -218,8 +218,8 @@ class StandingWave(AbstractProblem):
     amplitude: float = 0.05
     dim: int = eqx.field(static=True, default=1)
     ends: Ends = eqx.field(static=True, default=Ends.MIRRORED)
-    material: AbstractMaterial = FixedCorotated(1e4, 0.3)
-    density: float = 1e3
+    material: AbstractMaterial = FixedCorotated(1e4, 0.3)  # the law, fixed corotated
+    density: float = 1e3  # ρ0 [kg/m^d]
 
     def __check_init__(self):
         require(isinstance(self.material, FixedCorotated), "The standing wave is exact for FixedCorotated only.")
