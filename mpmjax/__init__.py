@@ -152,6 +152,5 @@ else:
     def __dir__() -> list[str]:
         return sorted({*globals(), *_LATE, *" ".join(_LATE.values()).split()})
 
-
     if {"IPython", "marimo"} & _sys.modules.keys():  # notebooks show scenes, runs and fits by what this adds to them
         _import_module(f"{__name__}.viz")

@@ -2,6 +2,8 @@
 
 import ast
 import dataclasses
+import json
+import os
 import re
 import subprocess
 import sys
@@ -80,7 +82,7 @@ def test_links_lead_to_files_and_headings(page):
 def test_files_that_a_page_names_exist(page):
     """Tests, scripts and examples, by their path from the root; NAME stands for any."""
     text = PAGES[page].read_text(encoding="utf-8")
-    named = set(re.findall(r"\b(?:tests|benchmarks|examples|mpmjax)/[\w/]+\.(?:py|toml|md)\b", text))
+    named = set(re.findall(r"\b(?:tests|benchmarks|examples|mpmjax)/[\w/]+\.(?:py|toml|md|ipynb)\b", text))
     assert not {name for name in named if "NAME" not in name and not (ROOT / name).exists()}
 
 
@@ -115,6 +117,20 @@ def test_the_snippets_of_a_page_run_in_their_order(page, tmp_path):
         f"\nfrom mpmjax.io import decode\ndecode({law!r}, mpm.AbstractMaterial, '[material]')" for law in laws
     )
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
+@pytest.mark.thorough
+def test_the_notebook_runs_and_shows_what_it_makes(tmp_path):
+    """Its cells as one program without a display; that a notebook imports the package is enough for the views."""
+    cells = json.loads((ROOT / "examples/first_steps.ipynb").read_text(encoding="utf-8"))["cells"]
+    code = "import sys\nsys.modules['IPython'] = sys\n"
+    code += "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    code += "\nassert all(thing._repr_html_()[0] == '<' for thing in (scene, run, result))"
+    environment = os.environ | {"MPLBACKEND": "Agg"}
+    ran = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
     assert ran.returncode == 0, ran.stderr
 
 
