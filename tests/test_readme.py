@@ -124,7 +124,7 @@ def test_the_snippets_of_a_page_run_in_their_order(page, tmp_path):
 def test_the_notebook_runs_and_shows_what_it_makes(tmp_path):
     """Its cells as one program without a display; that a notebook imports the package is enough for the views."""
     cells = json.loads((ROOT / "examples/first_steps.ipynb").read_text(encoding="utf-8"))["cells"]
-    code = "import sys\nsys.modules['IPython'] = sys\n"
+    code = "import sys\nsys.modules['marimo'] = sys\n"
     code += "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     code += "\nassert all(thing._repr_html_()[0] == '<' for thing in (scene, run, result))"
     environment = os.environ | {"MPLBACKEND": "Agg"}
