@@ -6,7 +6,9 @@ Ctrl-C ends the command as quietly as SIGTERM does, not with a traceback of what
 
 import importlib
 import importlib.util
+import itertools
 import json
+import math
 import os
 import re
 import signal
@@ -135,8 +137,24 @@ def scene_table(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
                 owner = owner[int(name)] if isinstance(owner, list) else owner.setdefault(name, {})
             owner[int(last) if isinstance(owner, list) else last] = value
         except (AttributeError, IndexError, TypeError, ValueError):
-            raise ValueError(f"--set {key}: {path} has no such place; tables of a list have numbers from 0.") from None
+            raise ValueError(f"{key}: {path} has no such place; tables of a list have numbers from 0.") from None
     return table
+
+
+def _numbers_of(span: str) -> list[str]:
+    """The changes KEY=VALUE of one --vary."""
+    key, _, numbers = span.partition("=")
+    try:
+        first, last, n, *logarithmic = numbers.split(":")
+        a, b, parts = float(first), float(last), int(n) - 1
+        log = logarithmic == ["log"]
+        valid = key and parts > 0 and math.isfinite(b - a) and (log or not logarithmic) and (a > 0 < b or not log)
+    except ValueError:
+        valid, a, b, parts, log = False, 0.0, 0.0, 1, False
+    example = "material.youngs_modulus=1e5:1e6:5, or with :log for equal ratios of positive numbers"
+    _require(valid, f"--vary must be KEY=A:B:N, two numbers at least, such as {example}, got {span!r}.")
+    inside = [a * (b / a) ** (i / parts) if log else a + (b - a) * i / parts for i in range(1, parts)]
+    return [f"{key}={float(f'{value:.15g}')!r}" for value in (a, *inside, b)]  # 0.3, not 0.30000000000000004
 
 
 MostSeconds = Annotated[
@@ -183,6 +201,15 @@ def run(
     steps: Annotated[int | None, typer.Option(help="End after so many steps, whatever t1.")] = None,
     method: Annotated[str | None, typer.Option(help="Another method, such as Explicit.")] = None,
     changes: Changes = None,
+    spans: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--vary",
+            metavar="KEY=A:B:N[:log]",
+            help="A study: a run for each of N numbers from A to B, of several keys for each combination. No frames "
+            "are kept: SCENE_study.csv, or -o, has a row with the end of each run.",
+        ),
+    ] = None,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
     most_seconds: MostSeconds = None,
     imports: Imports = None,
@@ -190,7 +217,9 @@ def run(
     """Simulate a scene and write its frames."""
     _require(not (overwrite and resume), "--overwrite starts a file anew and --resume continues it: give one of them.")
     _require(steps is None or t1 is None, "--steps and --t1 both say where the run ends: give one of them.")
-    output = Path(f"{scene.stem}.vtkhdf") if output is None else output
+    output = Path(f"{scene.stem}_study.csv" if spans else f"{scene.stem}.vtkhdf") if output is None else output
+    _require(not spans or output.suffix == ".csv", f"--vary writes a table, a .csv file, got -o {output}.")
+    _require(not (spans and resume), "--resume continues one run, not a study: leave it or --vary out.")
     free = overwrite or resume or not output.exists()
     _require(free, f"{output} exists: choose another name, or give --overwrite or --resume.")
     _require_folder(output)
@@ -202,6 +231,13 @@ def run(
         known = isinstance(step, (int, float)) and steps > 0
         _require(known, "--steps must be positive and needs a step in seconds, from the file or by --dt.")
         changed.append(f"run.t1={steps * float(step or 0)!r}")
+    members = list(itertools.product(*map(_numbers_of, spans or ())))
+    if spans:
+        scene_table(scene, [*changed, *members[0]])
+        _require("auto" not in map(settings.get, ("dt", "method")), '--vary needs a method, and a step or "stable".')
+        with _package(imports) as cli:
+            cli.study_scene(scene, output, changed, members, quiet=quiet)
+        return
     with _package(imports) as cli:
         cli.run_scene(
             scene, output, changed, overwrite=overwrite, resume=resume, quiet=quiet, most_seconds=most_seconds

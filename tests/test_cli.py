@@ -1,5 +1,6 @@
 """Each command of the shell, on good input and on bad: one clear line, exit code 2, no traceback, nothing lost."""
 
+import csv
 import json
 import re
 import subprocess
@@ -20,6 +21,7 @@ from mpmjax.cli._commands import _summary
 from mpmjax.cli._fit_file import leaf_of, read_fit
 from mpmjax.cli._scene_file import read_scene_file, read_simulation
 from mpmjax.fitting._columns import read_columns
+from mpmjax.simulation._simulate import integrate
 from mpmjax.viz import COLOURS
 from mpmjax_command import scene_table
 
@@ -120,6 +122,11 @@ def test_who_asks_or_errs_does_not_wait_for_jax(tmp_path):
         "run scene.toml -o a.h5 --set particles.density.x=1": "has no such place",
         "run scene.toml -o a.h5 --steps 0": "--steps must be positive",
         "run scene.toml -o a.h5 --steps 2 --t1 1": "give one of them",
+        "run scene.toml --vary run.dt=1:2": "--vary must be KEY=A:B:N",
+        "run scene.toml --vary run.dt=0:2:3:log": "--vary must be KEY=A:B:N",
+        "run scene.toml --vary run.dt=1:2:3 -o a.h5": "writes a table",
+        "run scene.toml --vary run.dt.x=1:2:3": "has no such place",
+        "run scene.toml --vary grid.spacing=1:2:3 --method auto": "--vary needs a method",
         "run scene.toml -o a.h5 --import none.py": "there is no file none.py",
         "check none.toml": "Cannot read the scene file none.toml",
         "fit scene.toml": "has no [fit] table",
@@ -172,6 +179,37 @@ def test_options_of_run_stand_for_keys_of_the_file(folder, tmp_path):
     run = mpm.load(tmp_path / "run.h5")
     assert (float(run.dt), int(run.final_step), type(run.method)) == (2e-3, 4, mpm.BackwardEuler)
     assert float(run.scene.material.youngs_modulus) == 2e5
+
+
+def test_a_study_has_a_row_for_each_combination(folder, tmp_path):
+    """With the numbers of a run of its own; one that fails says why; nothing compiles for another number."""
+    out = tmp_path / "study.csv"
+    words = ("run", folder / "scene.toml", "-o", out, "--vary")
+    counted = integrate._cached._cache_size()
+    spans = "material.poisson_ratio=0.1:0.5:3", "--vary", "material.youngs_modulus=1e4:1e6:3:log"
+    code, said, err = shell(*words, *spans)
+    assert code == 0, err
+    assert integrate._cached._cache_size() <= counted + 1
+    assert "9 of 9: material.poisson_ratio=0.5" in said
+    assert f"written {out} (9 rows, 3 of runs that failed)" in said
+    rows = list(csv.DictReader(out.open(encoding="utf-8")))
+    stiffness = [float(row["material.youngs_modulus"]) for row in rows]
+    np.testing.assert_allclose(stiffness, [1e4, 1e5, 1e6] * 3)
+    assert [bool(row["failure"]) for row in rows] == [False] * 6 + [True] * 3
+    assert "poisson_ratio must be strictly between" in rows[-1]["failure"]
+    changes = [f"--set={key}={rows[3][key]}" for key in ("material.poisson_ratio", "material.youngs_modulus")]
+    assert shell("run", folder / "scene.toml", "-o", tmp_path / "one.vtkhdf", *changes)[0] == 0
+    for name, column in mpm.table(tmp_path / "one.vtkhdf").items():
+        assert float(rows[3][name]) == column[-1] or np.isnan(column[-1]), name
+    assert "exists: choose another name" in refused(*words, "material.poisson_ratio=0.1:0.2:2")
+    assert "must be a whole number" in refused(*words, "run.save_every=1:2:2", "--overwrite")
+    assert "change neither particles nor nodes" in refused(
+        *words, "particles.0.region.upper.0=0.3:0.5:2", "--overwrite"
+    )
+    moving = "--set", "particles.0.velocity=[0.0, 0.0]", "--overwrite"
+    code, said, _ = shell(*words, "particles.0.velocity.0=0:1e4:2", *moving)
+    assert code == 0
+    assert re.search(r"\n2 of 2: particles.0.velocity.0=10000.0: .*particle", said)
 
 
 def test_check_says_what_a_scene_takes_and_what_looks_wrong(folder, tmp_path):

@@ -14,6 +14,7 @@ from helpers import cloud, rotation_matrix
 
 import mpmjax as mpm
 from mpmjax import linalg as la
+from mpmjax.io import _schema
 from mpmjax.io._schema import decode, encode
 from mpmjax.verification import check_law
 
@@ -97,10 +98,56 @@ def test_files_hold_weights_of_several_shapes():
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_law_that_files_cannot_hold_is_refused_as_it_is_registered():
-    """And not when a run is over and is to be saved."""
-    with pytest.raises(ValueError, match=r"Perceptron's argument 'network' is annotated as .*MLP.*, which"):
-        mpm.register(Perceptron)
+def test_a_run_whose_law_holds_a_network_is_saved_loaded_resumed_and_drawn(tmp_path, monkeypatch):
+    """Bit for bit, with functions that have names and that have none; without its class the file is refused."""
+    mpm.register(Perceptron)
+    monkeypatch.setattr(_schema, "_registered", _schema._registered | {"Perceptron": Perceptron})
+    grid, particles = cloud(2, p=20, cells=3)
+    for number, activation in enumerate((jnp.tanh, eqx.nn.PReLU(0.25))):
+        law = Perceptron(1e4, eqx.nn.MLP(2, 1, 5, 1, activation, key=jax.random.key(0)))
+        scene, path = mpm.Scene(grid, law), tmp_path / f"{number}.vtkhdf"
+        mpm.record(path, scene, particles, t1=2e-4, dt=1e-4, save_every=1)
+        loaded = mpm.load(path).scene.material
+        assert jax.tree.structure(loaded) == jax.tree.structure(law)
+        jax.tree.map(
+            np.testing.assert_array_equal, *(eqx.filter(a, eqx.is_array) for a in (loaded.network, law.network))
+        )
+    whole = mpm.simulate(scene, particles, t1=4e-4, dt=1e-4)
+    mpm.record(path, scene, particles, t1=4e-4, dt=1e-4, save_every=1, resume=True)
+    again = mpm.load(path)
+    np.testing.assert_array_equal(again.final.F, whole.final.F)
+    mpm.render(again, tmp_path / "run.png", frame=-1)
+    assert (tmp_path / "run.png").exists()
+    other = eqx.tree_at(lambda s: s.material.network.layers[0].bias, scene, jnp.zeros(5))
+    with pytest.raises(ValueError, match=r"holds another run: its .*layers\.0\.bias is another array"):
+        mpm.record(path, other, particles, t1=6e-4, dt=1e-4, save_every=1, resume=True)
+    monkeypatch.delitem(_schema._registered, "Perceptron")
+    with pytest.raises(ValueError, match="unknown kind 'Perceptron'"):
+        mpm.load(path)
+
+
+def test_what_files_do_not_know_of_a_network_is_refused():
+    """A function of one's own, fields that are not those of the class, classes and functions that are no network's."""
+    key, arrays = jax.random.key(0), {}
+    with pytest.raises(ValueError, match=r"layers\.1\.fn is a function, which files cannot hold"):
+        encode(eqx.nn.Sequential([eqx.nn.Linear(2, 2, key=key), eqx.nn.Lambda(lambda x: x + 1)]), {})
+    data = encode(eqx.nn.Linear(2, 3, key=key), arrays, "linear")
+    assert decode(data, eqx.Module, "", arrays).weight.shape == (3, 2)
+    with pytest.raises(ValueError, match="only a run's file holds its weights"):
+        encode(eqx.nn.Linear(2, 3, key=key))
+    for change, message in (
+        ({"bias": {"array": "gone"}}, "refers to the array 'gone'"),
+        ({"more": 1}, "has other fields than a Linear of this version of equinox"),
+        ({"kind": "equinox.nn.inference_mode"}, "cannot be the kind 'equinox.nn.inference_mode'"),
+        (
+            {"use_bias": {"function": "jax.numpy.save"}},
+            "must be a function of jax.nn or jax.numpy, got 'jax.numpy.save'",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            decode(data | change, eqx.Module, "", arrays)
+    with pytest.raises(ValueError, match="cannot be the kind 'equinox"):
+        decode(data, mpm.AbstractMaterial, "", arrays)
 
 
 @pytest.fixture(scope="module")

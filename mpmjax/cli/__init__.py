@@ -7,5 +7,6 @@ from mpmjax.cli._commands import (
     fit_scene as fit_scene,
     installation as installation,
     run_scene as run_scene,
+    study_scene as study_scene,
 )
 from mpmjax.cli._scene_file import load_scene as load_scene, scene_schema as scene_schema

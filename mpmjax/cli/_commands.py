@@ -1,12 +1,14 @@
-"""The shell's commands, after `mpmjax_command` has read their options: run, check, fit, chart, describe."""
+"""The shell's commands, after `mpmjax_command` has read their options: run, study, check, fit, chart, describe."""
 
+import csv
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
@@ -29,7 +31,7 @@ from mpmjax.fitting import (
 )
 from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, replacing, reporting, standing_in, stopping, table
 from mpmjax.native import BACKENDS, backend
-from mpmjax.simulation import Problem, Run, initial_state, no_steps, run_to
+from mpmjax.simulation import Problem, Run, SimulationError, initial_state, no_steps, run_to
 from mpmjax.state import Particles
 from mpmjax.stepping import Explicit, stable_dt, step
 from mpmjax.viz import draw_chart, draw_fit, render, write_fit, write_trials
@@ -75,6 +77,51 @@ def run_scene(
         print(f"{'end':<18} t = {float(run.final_step * run.dt):.6g} s, {frames} frames")
     reached = f"complete already: it reaches t = {float(run.final_step * run.dt):.6g} s" if resume and not taken else ""
     print(f"written            {output} ({_bytes(output.stat().st_size)}) {reached}".rstrip())
+
+
+def study_scene(
+    path: Path, output: Path, changes: Sequence[str], members: Sequence[Sequence[str]], *, quiet: bool = False
+) -> None:
+    """Simulate a scene file once for each of some sets of further changes to it, and write a CSV file with a row for
+    each: what changes, the numbers of its last frame (see `table`), and what a run that failed says. All runs are one
+    compiled program."""
+
+    def simulation(member: Sequence[str]) -> Simulation:
+        return read_simulation(path, [*changes, *member])
+
+    def shapes(simulation: Simulation) -> Any:
+        parts = simulation.scene, simulation.particles, simulation.method
+        return jax.tree.structure(parts), [np.shape(leaf) for leaf in jax.tree.leaves(parts)]
+
+    first, rows = simulation(members[0]), list[dict[str, Any]]()
+    same = True
+    with suppress(ValueError):  # one that cannot be is a row
+        same = shapes(simulation(members[-1])) == shapes(first)
+    require(same, f"--vary takes numbers that change neither particles nor nodes, but {', '.join(members[-1])} does.")
+    standing = f"{output} has {{}} of {len(members)} rows.".format
+    with TemporaryDirectory() as folder, reporting(lambda: standing(len(rows))):
+        frames = Path(folder) / "frames"
+        for member in members:
+            failure = ""
+            try:
+                here = simulation(member)
+                settings = here.settings | {"save_every": first.save_every}
+                record(frames, here.scene, here.particles, **settings, **here.output)
+            except (ValueError, SimulationError) as error:
+                failure = str(error).split(f" {frames}")[0]
+            numbers = {name: column[-1] for name, column in table(frames).items()} if frames.exists() else {}
+            rows.append(dict(change.split("=", 1) for change in member) | numbers | {"failure": failure})
+            frames.unlink(missing_ok=True)
+            names = sorted({name: None for row in rows for name in row}, key=lambda name: name == "failure")
+            with replacing(output) as aside, open(aside, "w", newline="", encoding="utf-8") as file:
+                writer = csv.DictWriter(file, names)
+                writer.writeheader()
+                writer.writerows(rows)
+            if not quiet:
+                end = failure or f"t = {numbers['time [s]']:.6g} s, total energy {numbers['total energy [J]']:.6g} J"
+                print(f"{len(rows)} of {len(members)}: {', '.join(member)}: {end}", flush=True)
+    failed = sum(bool(row["failure"]) for row in rows)
+    print(f"written {output} ({len(rows)} rows{f', {failed} of runs that failed' * (failed > 0)})")
 
 
 @contextmanager
@@ -326,7 +373,7 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
         say("written", str(plot))
 
 
-def describe_run(path: Path, csv: Path | None = None) -> str:
+def describe_run(path: Path, table_path: Path | None = None) -> str:
     """A run's file in words; its table as CSV, if a place for that is given."""
     run = load(path)
     lines = {
@@ -335,12 +382,12 @@ def describe_run(path: Path, csv: Path | None = None) -> str:
         "materials": ", ".join(run.scene.titles),
     }
     described = [*(f"{name:<18} {text}" for name, text in lines.items()), _summary(run.frame(0), run)]
-    if csv is not None:
+    if table_path is not None:
         columns = table(path)
-        with replacing(csv) as aside:
+        with replacing(table_path) as aside:
             head = ",".join(columns)
             np.savetxt(aside, np.stack(list(columns.values()), axis=1), "%.17g", ",", header=head, comments="")
-        described.append(f"{'written':<18} {csv}")
+        described.append(f"{'written':<18} {table_path}")
     return "\n".join(described)
 
 

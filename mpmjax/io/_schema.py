@@ -22,6 +22,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray
 
@@ -47,9 +48,9 @@ def register(cls: Registered) -> Registered:
 
     In a file such an object is a table whose `kind` is the class's name and whose other keys are its constructor's
     arguments. So each argument must be a field of the same name, annotated with what files can hold: float, int, bool,
-    str, an array, an enumeration, an equinox module whose class is the package's or registered, or tuples of such.
-    Those of `equinox.nn` are none of these: write a network as layers of your own, each with its weights as fields
-    (`examples/learned_law.py`).
+    str, an array, an enumeration, an equinox module whose class is the package's, of `equinox.nn` or registered, a
+    function of `jax.nn` or a compiled one of `jax.numpy`, or tuples of such. So a law may hold a network,
+    `network: eqx.nn.MLP`; a run's file has its weights, a scene file cannot.
     Numbers in files are finite; a corner of a box that may have no end is annotated as `mpmjax.geometry.Corner`.
 
     A file names classes and never executes code: import the module that registers a class before reading a file with
@@ -67,13 +68,13 @@ def register(cls: Registered) -> Registered:
     """
     require(is_class(cls, eqx.Module), f"register takes a class, an equinox.Module, got {_short(cls)}.")
     name = cls.__name__
-    other = next((c for c in _known() if c.__name__ == name), cls)
+    other = next((c for c in known_classes() if c.__name__ == name), cls)
     require(
         (other.__module__, other.__qualname__) == (cls.__module__, cls.__qualname__),  # which one defined anew keeps
         f"register: the name {name!r} is taken by {other.__module__}.{other.__qualname__}; choose another.",
     )
     names = {f.name for f in fields(cls)}
-    for key, (hint, _) in _parameters(cls).items():
+    for key, (hint, _) in parameters_of(cls).items():
         what = f"register: {name}'s argument {key!r}"
         require(key in names, f"{what} is not a field of {name}, from which a file would take its value: make it one.")
         require(_can_be_held(hint), f"{what} is annotated as {hint!r}, which files cannot hold (see its docstring).")
@@ -98,11 +99,11 @@ def _mesh(file: str, spacing: Scalar, scale: Scalar = 1.0) -> SampledDistance:
     return sample_mesh(file, float(spacing), scale=float(scale))
 
 
-_MADE: dict[str, tuple[Callable[..., Any], type]] = {"Mesh": (_mesh, SampledDistance)}
+MADE: dict[str, tuple[Callable[..., Any], type]] = {"Mesh": (_mesh, SampledDistance)}
 """Kinds that scene files may name beside classes: functions, and what they make, which a run's file then holds."""
 
 
-def _known() -> tuple[type, ...]:
+def known_classes() -> tuple[type, ...]:
     return (*saved_classes(), *_registered.values())
 
 
@@ -110,12 +111,30 @@ def _can_be_held(hint: Any) -> bool:
     """Whether some value of an annotation can stand in a file."""
 
     def can(a: Any) -> bool:
-        if is_class(a, eqx.Module):  # made of its fields; those of `equinox.nn` are made of sizes and a key
-            return is_abstract(a) or set(_parameters(a)) <= {f.name for f in fields(a)}
-        items = get_args(a) if get_origin(a) in (tuple, list) else ()
-        return is_class(a, enum.Enum) or any(_can_be_held(item) for item in items if item is not Ellipsis)
+        if is_class(a, eqx.Module):  # a class of one's own is made of its fields
+            return is_abstract(a) or _is_network(a) or set(parameters_of(a)) <= {f.name for f in fields(a)}
+        items = [a for a in get_args(a) if a is not Ellipsis] if get_origin(a) in (tuple, list) else []
+        return is_class(a, enum.Enum) or _is_callable(a) or any(map(_can_be_held, items))
 
-    return bool(_forms(hint)) or any(can(a) for a in alternatives(hint))
+    return bool(forms_of(hint)) or any(can(a) for a in alternatives(hint))
+
+
+_FUNCTIONS: dict[str, Callable] = {
+    f"{module.__name__}.{name}": f
+    for module, attribute in ((jax.nn, "__call__"), (jnp, "lower"))  # what is compiled reads and writes no files
+    for name, f in vars(module).items()
+    if name[0] != "_" and hasattr(f, attribute)
+}
+"""Functions that files name, such as the activation of a network."""
+
+
+def _is_network(cls: type) -> bool:
+    """Whether a class is one of `equinox.nn`. Files have its fields: its constructor takes sizes and a key."""
+    return getattr(eqx.nn, cls.__name__, None) is cls
+
+
+def _is_callable(hint: Any) -> bool:
+    return Callable in (hint, get_origin(hint))
 
 
 _SMALL = 64  # most numbers that are written out, and that are read as a tuple where both are taken
@@ -129,10 +148,14 @@ def encode(value: Any, arrays: dict[str, np.ndarray] | None = None, path: str = 
     than 64 numbers, each under its path; {"array": path} stands in their place. A ValueError names a class that is
     neither the package's own nor registered."""
     match value:
-        case _ if type(value) in _known():
-            parts = {name: getattr(value, name) for name in _parameters(type(value))}
+        case _ if type(value) in known_classes():
+            parts = {name: getattr(value, name) for name in parameters_of(type(value))}
             keys = {k: encode(v, arrays, f"{path}.{k}".lstrip(".")) for k, v in parts.items() if v is not None}
             return {"kind": type(value).__name__, **keys}
+        case _ if _is_network(type(value)):
+            return _network_data(value, arrays, path)
+        case _ if name := next((name for name, f in _FUNCTIONS.items() if f is value), None):
+            return {"function": name}
         case enum.Enum():
             return value.value
         case bool() | int() | float() | str() if not isinstance(value, np.generic):
@@ -148,7 +171,8 @@ def encode(value: Any, arrays: dict[str, np.ndarray] | None = None, path: str = 
         case _:
             raise ValueError(
                 f"{path or 'The object'} is a {type(value).__name__}, which files cannot hold: they know the package's "
-                "own classes and those that are registered. Put @mpm.register before the class."
+                "own classes, those of equinox.nn, those that are registered, and functions of jax.nn and jax.numpy. "
+                "Put @mpm.register before the class."
             )
 
 
@@ -157,21 +181,29 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     abstract class, union or annotation of numbers that it must be of, `where` the place in the file that errors
     name, such as "[material]", `arrays` what `encode` put aside. A ValueError says in one line what is unknown,
     missing or unfit, or what the constructor refuses."""
-    options = alternatives(expected)
-    fitting = [c for c in _known() if any(is_class(a, eqx.Module) and issubclass(c, a) for a in options)]
+    options: list[Any] = alternatives(expected)
+    if any(map(_is_callable, options)) and isinstance(data, dict):
+        if "kind" not in data:
+            name = str(data.get("function"))
+            _require(name in _FUNCTIONS, where, f"must be a function of jax.nn or jax.numpy, got {_short(name)}")
+            return _FUNCTIONS[name]
+        options = [eqx.Module]
+    if isinstance(data, dict) and str(data.get("kind")).startswith("equinox.nn."):
+        return _network(data, options, where, arrays)
+    fitting = [c for c in known_classes() if any(is_class(a, eqx.Module) and issubclass(c, a) for a in options)]
     fitting.sort(key=lambda c: c.__name__)
     classes: dict[str, Callable[..., Any]] = {c.__name__: c for c in fitting}
     if arrays is None:  # a file that a person writes
-        classes |= {name: make for name, (make, cls) in _MADE.items() if cls.__name__ in classes}
+        classes |= {name: make for name, (make, cls) in MADE.items() if cls.__name__ in classes}
     items = [get_args(a)[0] for a in options if get_origin(a) in (tuple, list)]
-    if items and isinstance(data, list) and (classes or not _forms(expected)):  # of objects, or of arrays
+    if items and isinstance(data, list) and (classes or not forms_of(expected)):  # of objects, or of arrays
         *outer, header = where.split(" ")  # of one of a list of tables it is that of the list in further brackets
         nth = " ".join([*outer, f"[{header}]"])
         return tuple(decode(d, items[0], f"{nth} {i}", arrays) for i, d in enumerate(data, 1))
     named = [get_args(a)[1] for a in options if get_origin(a) is dict]
     if named and isinstance(data, dict) and data and all(isinstance(d, dict) for d in data.values()):  # of objects
         return {name: decode(d, named[0], f"{where[:-1]}.{name}]", arrays) for name, d in data.items()}
-    number = isinstance(data, (int, float)) and not isinstance(data, bool) and (float, 0) in _forms(expected)
+    number = isinstance(data, (int, float)) and not isinstance(data, bool) and (float, 0) in forms_of(expected)
     if any(is_class(a, eqx.Module) for a in options) and not number:
         table: Any = {"kind": data} if isinstance(data, str) else data
         opened = any(is_abstract(a) for a in options)  # to classes that are registered
@@ -200,13 +232,69 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     return _numbers(data, expected, where, arrays)
 
 
+def _network_data(network: Any, arrays: dict[str, np.ndarray] | None, path: str) -> dict[str, Any]:
+    """The fields of a module of `equinox.nn`. Their annotations do not say what is a tuple and what an array, so all
+    arrays stand beside. Functions that it has by default are left out: those may have no name."""
+
+    def part(value: Any, path: str) -> Any:
+        if value is None:
+            return None
+        if isinstance(value, (tuple, list)):
+            return [part(v, f"{path}.{i}") for i, v in enumerate(value)]
+        if not isinstance(value, (np.ndarray, np.generic, jax.Array)):
+            return encode(value, arrays, path)
+        if arrays is None:
+            raise ValueError(f"{path} is a network's: only a run's file holds its weights.")
+        arrays[path] = np.asarray(value)
+        return {"array": path}
+
+    kind, usual = type(network), _usual_functions(type(network))
+    parts = {f.name: getattr(network, f.name) for f in fields(kind)}
+    keys = {name: part(v, f"{path}.{name}") for name, v in parts.items() if not (name in usual and v is usual[name])}
+    return {"kind": f"equinox.nn.{kind.__name__}", **keys}
+
+
+def _network(data: dict[str, Any], options: list[Any], where: str, arrays: dict[str, np.ndarray] | None) -> Any:
+    """The module of `equinox.nn` that `_network_data` describes, without a call of its constructor, which takes sizes
+    and a key for random weights."""
+
+    def part(data: Any) -> Any:
+        if isinstance(data, list):
+            return tuple(map(part, data))
+        if not isinstance(data, dict):
+            return data
+        if "array" not in data:
+            return decode(data, Callable, where, arrays)
+        name = data["array"]
+        _require(arrays is not None and name in arrays, where, f"refers to the array {name!r}, which is not there")
+        return (arrays or {})[name]
+
+    kind: Any = getattr(eqx.nn, data["kind"].removeprefix("equinox.nn."), None)
+    fits = isinstance(kind, type) and any(is_class(a, eqx.Module) and issubclass(kind, a) for a in options)
+    _require(fits, where, f"cannot be the kind {_short(data['kind'])}")
+    parts = _usual_functions(kind) | {name: part(value) for name, value in data.items() if name != "kind"}
+    same = {f.name for f in fields(kind)} == parts.keys()
+    _require(same, where, f"has other fields than a {kind.__name__} of this version of equinox")
+    network = object.__new__(kind)
+    for name, value in parts.items():
+        object.__setattr__(network, name, value)
+    return network
+
+
+def _usual_functions(network: type) -> dict[str, Callable]:
+    """The functions that a module has as fields by default."""
+    defaults = {name: default for name, (_, default) in parameters_of(network).items()}
+    names = {f.name for f in fields(network)}
+    return {k: f for k, f in defaults.items() if k in names and callable(f) and f is not inspect.Parameter.empty}
+
+
 def arguments(
     function: Callable, table: Any, where: str, arrays: dict[str, np.ndarray] | None = None, without: Iterable[str] = ()
 ) -> dict[str, Any]:
     """The keyword arguments of a function (or class) that a table describes (see `decode`), `without` those that it
     has otherwise."""
     _require(isinstance(table, dict), where, f"must be a table, got {_short(table)}")
-    parameters = {name: p for name, p in _parameters(function).items() if name not in without}
+    parameters = {name: p for name, p in parameters_of(function).items() if name not in without}
     for key in table:
         if key not in parameters:
             hint = _close(key[:60], parameters)
@@ -227,7 +315,7 @@ def arguments(
 
 def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray] | None) -> Any:
     """Numbers, words and switches, single or in (nested) lists."""
-    forms = _forms(expected)
+    forms = forms_of(expected)
     if isinstance(data, dict) and set(data) == {"array"} and arrays is not None:
         _require(data["array"] in arrays, where, f"refers to the array {data['array']!r}, which is not there")
         a = arrays[data["array"]]
@@ -255,47 +343,7 @@ def _plain(data: Any) -> Any:
     return tuple(map(_plain, data)) if isinstance(data, list) else data
 
 
-def table_schema(function: Callable, without: Iterable[str] = (), kind: str | None = None) -> dict[str, Any]:
-    """The JSON schema of a table of a function's arguments (see `arguments`), which editors read; `kind` is its key of
-    that name. Classes are references to `class_schemas`."""
-    parameters = {name: p for name, p in _parameters(function).items() if name not in without}
-    properties = {name: _value_schema(hint) for name, (hint, _) in parameters.items()}
-    required = [name for name, (_, default) in parameters.items() if default is inspect.Parameter.empty]
-    text = " ".join((function.__doc__ or "").split("\n\n")[0].split())
-    named = {} if kind is None else {"kind": {"const": kind}}
-    table = {"type": "object", "properties": named | properties, "additionalProperties": False}
-    return table | {"description": text, "required": required}
-
-
-def class_schemas() -> dict[str, Any]:
-    """The JSON schema of each class that files can hold, and of what else has a kind, by name."""
-    made = {name: make for name, (make, _) in _MADE.items()}
-    return {name: table_schema(c, kind=name) for name, c in ({c.__name__: c for c in _known()} | made).items()}
-
-
-def _value_schema(hint: Any) -> dict[str, Any]:
-    """The JSON schema of what an annotation takes."""
-    json, options = {float: "number", int: "integer", bool: "boolean", str: "string"}, alternatives(hint)
-    choices: list[dict[str, Any]] = []
-    for kind, depth in sorted(_forms(hint), key=str):
-        value: dict[str, Any] = {"type": json[kind]}
-        for _ in range(depth):
-            value = {"type": "array", "items": value}
-        choices.append(value)
-    for cls in [c for c in _known() if any(is_class(a, eqx.Module) and issubclass(c, a) for a in options)]:
-        choices.append({"$ref": f"#/$defs/{cls.__name__}"})
-        if all(default is not inspect.Parameter.empty for _, default in _parameters(cls).values()):
-            choices.append({"const": cls.__name__})  # its kind alone
-        choices += [{"$ref": f"#/$defs/{name}"} for name, (_, result) in _MADE.items() if result is cls]
-    for a in options:
-        if is_class(a, enum.Enum):
-            choices.append({"enum": [member.value for member in a]})
-        elif get_origin(a) in (tuple, list) and (item := _value_schema(get_args(a)[0])) and not _forms(a):
-            choices += [{"type": "array", "items": item}, item]
-    return {"anyOf": choices} if choices else {}
-
-
-def _parameters(function: Callable) -> dict[str, tuple[Any, Any]]:
+def parameters_of(function: Callable) -> dict[str, tuple[Any, Any]]:
     """Annotation and default of each argument of a function or constructor.
 
     Where a field has a converter, equinox says `Any` of the argument, and the field itself says more.
@@ -319,7 +367,7 @@ def _field_types(cls: type) -> dict[str, Any]:
     return typing.get_type_hints(cls, include_extras=True) if any(isinstance(t, str) for t in types.values()) else types
 
 
-def _forms(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
+def forms_of(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
     """Kind of number and depth of lists that an annotation takes, `within` that of a sequence."""
     forms: set[tuple[type, int]] = set()
     if not within and any(a in (jax.Array, np.ndarray) for a in alternatives(hint)):
@@ -330,7 +378,7 @@ def _forms(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
         elif get_origin(a) is Literal:
             forms.add((str, 0))
         elif get_origin(a) in (tuple, list):
-            forms |= {(kind, depth + 1) for kind, depth in _forms(get_args(a)[0], within=True)}
+            forms |= {(kind, depth + 1) for kind, depth in forms_of(get_args(a)[0], within=True)}
         elif is_class(a, AbstractArray):
             axes = a.dim_str.split()
             forms |= {(float, len(axes)), (float, len([axis for axis in axes if not axis.startswith("*")]))}
