@@ -4,12 +4,12 @@ import html
 from unittest.mock import Mock
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mpmjax as mpm
-from mpmjax.fitting import _evaluation
 from mpmjax.fitting._evaluation import Kept, costs_at, evaluated, parts_kept
 from mpmjax.fitting._observation import between
 from mpmjax.fitting._problem import FitProblem
@@ -677,14 +677,15 @@ def test_numbers_of_observations_have_derivatives_in_a_program_of_their_own():
     assert (np.abs(J).max(axis=0) > 0).all()
 
 
-def test_a_new_observation_leaves_the_program_of_the_run_as_it_is():
+def test_a_new_observation_leaves_the_program_of_the_run_as_it_is(caplog):
     """Another function, and other parameters, of one scene; the numbers are those of observations that are a part of
     the run's program, as where memory has no room for states."""
     times, x, _ = tracks()
     of = {"E": STIFFNESS}
 
     def problem(function, memory=2**28):
-        return FitProblem(experiment(mpm.Series(times, x[:, 0], function, sigma=NOISE)), of, memory)
+        seen = mpm.Series(times, x[:, 0], function, sigma=NOISE)
+        return FitProblem(experiment(seen, steps=STEPS + 1), of, memory)
 
     def first(scene, particles):
         return particles.x[0]
@@ -692,8 +693,10 @@ def test_a_new_observation_leaves_the_program_of_the_run_as_it_is():
     z, sigmas, points = jnp.zeros(1), (jnp.asarray(NOISE),), np.linspace(-0.1, 0.1, 3)[:, None]
     kept = parts_kept(problem(first), 2)
     assert kept == (Kept((True, False, False, False)),)  # of x, v, C and F
-    at, squares = evaluated(problem(first), z, z, sigmas, kept), costs_at(problem(first), points, sigmas, 3)
-    compiled = [program._cached._cache_size() for program in (_evaluation._run, _evaluation._runs)]
+    with jax.log_compiles():
+        at, squares = evaluated(problem(first), z, z, sigmas, kept), costs_at(problem(first), points, sigmas, 3)
+    names = [record.getMessage() for record in caplog.records]
+    assert sum("compilation of jit(_run)" in name for name in names) == 2
     scarce = problem(first, 1)
     r, J = jacobian(scarce, z, sigmas)
     assert parts_kept(scarce, 1) is None
@@ -703,6 +706,10 @@ def test_a_new_observation_leaves_the_program_of_the_run_as_it_is():
     assert squares[1] == pytest.approx((r**2).sum() / 2)
     of["E"] = eqx.tree_at(lambda p: p.where, STIFFNESS, lambda e: e.scene.material.youngs_modulus)
     third = problem(lambda scene, particles: particles.x[3] - particles.x[0])
-    assert np.abs(evaluated(third, z, z, sigmas, kept).r - at.r).max() > 1
-    costs_at(third, points, sigmas, 3)
-    assert compiled == [program._cached._cache_size() for program in (_evaluation._run, _evaluation._runs)]
+    caplog.clear()
+    with jax.log_compiles():
+        assert np.abs(evaluated(third, z, z, sigmas, kept).r - at.r).max() > 1
+        costs_at(third, points, sigmas, 3)
+    names = [record.getMessage() for record in caplog.records]
+    assert sum("compilation of jit(_compared)" in name for name in names) == 2
+    assert not any("compilation of jit(_run)" in name for name in names)

@@ -22,7 +22,6 @@ from mpmjax.fitting._experiment import (
     Experiment as Experiment,
     Shown as Shown,
 )
-from mpmjax.fitting._field import Field as Field
 from mpmjax.fitting._fit import EnsembleFit as EnsembleFit, fit as fit, fit_ensemble as fit_ensemble
 from mpmjax.fitting._observation import (
     Curve as Curve,
@@ -36,6 +35,7 @@ from mpmjax.fitting._parameter import (
     AbstractParameter as AbstractParameter,
     AbstractPrior as AbstractPrior,
     Bounded as Bounded,
+    Field as Field,
     Gaussian as Gaussian,
     Positive as Positive,
     Smooth as Smooth,

@@ -225,7 +225,7 @@ def require_derivative(end: Search) -> None:
 
 def require_influence(problem: FitProblem, sigmas: Sigmas, seen: Evaluation) -> None:
     """Check that the data depend on every coordinate, at the first guess."""
-    rounding = _ROUNDINGS * float(jnp.finfo(problem.dtype).eps) * float(problem.size_of_data(sigmas))
+    rounding = _ROUNDINGS * float(problem.rounding_of_data(sigmas))
     if seen.jacobian is None:
         # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.
         size = np.abs(np.asarray(seen.gradient)) / max(np.sqrt(2 * float(seen.cost)), np.finfo(float).tiny)

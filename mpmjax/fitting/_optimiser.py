@@ -133,9 +133,9 @@ class LevenbergMarquardt(AbstractOptimiser):
 @eqx.filter_jit
 def _begun(solver: Any, z: Coordinates, rows: int) -> Any:
     """The state before the first iteration, of so many residuals."""
-    r, J, rooms = (jnp.zeros(shape, z.dtype) for shape in ((rows,), (rows, len(z)), (2, 2, len(z))))
-    shape = jax.eval_shape(lambda: r)
-    return solver.init(_residuals, z, (Evaluated(z, r, J, rooms), (), None), {}, shape, None, frozenset())
+    r, J, room = (jnp.zeros(shape, z.dtype) for shape in ((rows,), (rows, len(z)), (2, len(z))))
+    at, shape = Evaluated(z, r, J, (room, room)), jax.eval_shape(lambda: r)
+    return solver.init(_residuals, z, (at, (), None), {}, shape, None, frozenset())
 
 
 class _TrustRegion(optimistix.ClassicalTrustRegion):
@@ -239,7 +239,9 @@ class LBFGS(AbstractOptimiser):
         steep = (state.past.count == 0) | (gradient @ newton[0] <= 0)
         along, past = _where(steep, steepest, newton)
         predicted_decrease = jnp.where(steep, jnp.minimum(state.predicted_decrease, gradient @ along), gradient @ along)
-        slack = problem.rounding(cost, sigmas)
+        # The part of the cost that may be rounding: each residual has that of the data, ε √Σ (data/σ)².
+        rounding = problem.rounding_of_data(sigmas).astype(cost.dtype)
+        slack = jnp.sqrt(2 * cost) * rounding + rounding**2 + float(jnp.finfo(cost.dtype).eps) * cost
 
         def evaluate(z: Coordinates) -> tuple[Array, Coordinates]:
             """The cost and its derivative; infinite where either fails."""

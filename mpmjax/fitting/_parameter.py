@@ -1,8 +1,9 @@
-"""Parameters that are fitted, the coordinates in which they are searched, and priors."""
+"""Parameters that are fitted, numbers and fields, the coordinates in which they are searched, and priors."""
 
 import abc
 from collections.abc import Callable
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import equinox as eqx
@@ -10,25 +11,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import as_floats, as_plain, require, require_fields, require_finite, require_positive
+from mpmjax._types import Array, Float, ParticleScalar, ParticleVector, Scalar
+from mpmjax.checks import (
+    as_floats,
+    as_plain,
+    canonical,
+    checked,
+    require,
+    require_fields,
+    require_finite,
+    require_positive,
+)
+from mpmjax.discretisation import BSpline, Grid, SplineGradient, gather, in_window, make_stencil
 from mpmjax.fitting._experiment import Experiment, drawn_nearer
+from mpmjax.state import Particles
 
 Value = Float[Array, "..."]
 Start = Scalar | Value | Float[np.ndarray, "..."] | tuple | list
 
 
 class AbstractPrior(eqx.Module):
-    """Prior knowledge of a parameter, as residuals that stand beside those of the data."""
+    """Prior knowledge of a parameter, as residuals beside those of the data."""
 
     @abc.abstractmethod
     def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
-        """The residuals [-], shape (k,).
-
-        Args:
-            value: the parameter's value, in its unit.
-            free: the same in a measure without bounds (see `AbstractParameter.free`), of the same shape.
-        """
+        """The residuals [-], shape (k,), of the value in its unit and, of the same shape, in a measure without bounds
+        (see `AbstractParameter.free`)."""
 
     @abc.abstractmethod
     def check(self, name: str, shape: tuple[int, ...]) -> None:
@@ -39,9 +47,7 @@ class AbstractPrior(eqx.Module):
         """How many numbers of a parameter of this shape it fixes by itself."""
 
     def distribution(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Mean and standard deviation of each number by itself, in the parameter's unit; None where it says nothing of
-        single numbers, which is the default."""
-        return None
+        """Mean and standard deviation of each number, in the parameter's unit. Default: None, nothing is known."""
 
     def drawn(self, rng: np.random.Generator) -> "AbstractPrior":
         """The prior as another measurement would have given it. Default: itself."""
@@ -54,7 +60,7 @@ class Gaussian(AbstractPrior):
 
     Args:
         mean: expected value, in the parameter's unit, one number or one for each entry.
-        sigma: its standard deviation, likewise.
+        sigma: standard deviation, likewise.
     """
 
     mean: Float[np.ndarray, "..."] = eqx.field(converter=as_floats)
@@ -68,21 +74,17 @@ class Gaussian(AbstractPrior):
     def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
         """(value − mean)/σ."""
         del free
-        mean, sigma = (jnp.broadcast_to(jnp.asarray(a, value.dtype), value.shape) for a in (self.mean, self.sigma))
-        return ((value - mean) / sigma).reshape(-1)
+        return ((value - jnp.asarray(self.mean, value.dtype)) / jnp.asarray(self.sigma, value.dtype)).reshape(-1)
 
     def distribution(self) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(self.mean), np.asarray(self.sigma)
 
     def drawn(self, rng: np.random.Generator) -> "Gaussian":
-        mean, sigma = self.distribution()
-        return Gaussian(mean + sigma * rng.normal(size=np.shape(mean)), sigma)
+        return Gaussian(self.mean + self.sigma * rng.normal(size=np.shape(self.mean)), self.sigma)
 
     def check(self, name: str, shape: tuple[int, ...]) -> None:
-        shapes = {np.shape(self.mean), np.shape(self.sigma)}
-        require(
-            shapes <= {(), shape}, f"The prior of {name!r} must have one number or shape {shape}, got {sorted(shapes)}."
-        )
+        shapes, fits = {np.shape(self.mean), np.shape(self.sigma)}, {(), shape}
+        require(shapes <= fits, f"The prior of {name!r} must have one number or shape {shape}, got {sorted(shapes)}.")
 
     def fixes(self, shape: tuple[int, ...]) -> int:
         return int(np.prod(shape))
@@ -92,16 +94,14 @@ class Smooth(AbstractPrior):
     """Prior knowledge of a field: neighbours differ little, by a normal distribution of mean zero.
 
     Neighbours are entries next to each other along an axis of the parameter, which is an array: the nodes of a `Field`,
-    or a history in time. The difference is that of logarithms of a `Positive` parameter (σ = 0.1: about 10 % from one
-    node to the next), of logits of a `Bounded` one, of values of an `Unbounded` one. The mean level is left free.
-
-    Squares draw a jump out over several nodes. With `robust` δ differences beyond δ standard deviations count but
-    linearly (pseudo-Huber, as of observations), and a jump stays one: for bodies made of regions.
+    or a history in time. The difference is that of logarithms of a `Positive` parameter, of logits of a `Bounded` one,
+    of values of an `Unbounded` one. The mean level is left free.
 
     Args:
-        sigma: standard deviation of the difference of two neighbours. On a lattice of half the spacing, the same
-            roughness is about 1/√2 of it.
-        robust: the difference, in standard deviations, beyond which squares grow but linearly. Default: none.
+        sigma: standard deviation of the difference of two neighbours, 0.1 of a `Positive` parameter for about 10 %. On
+            a lattice of half the spacing, the same roughness is about 1/√2 of it.
+        robust: the difference, in standard deviations, beyond which squares grow but linearly (pseudo-Huber), so that a
+            jump stays one, for bodies made of regions. Default: none.
     """
 
     sigma: Scalar = eqx.field(converter=as_floats)
@@ -134,19 +134,18 @@ class Smooth(AbstractPrior):
 class AbstractParameter(eqx.Module):
     """A number, or an array of them, that is fitted.
 
-    It is searched in a coordinate z, shape as the value's, that takes every real number and is zero at the first guess:
-    so no bound is ever crossed, and a step of one is a large but not an absurd change.
+    It is searched in a coordinate z, of the value's shape, that takes every real number and is zero at the first guess:
+    no bound is ever crossed, and a step of one is a large but not an absurd change.
     """
 
     where: eqx.AbstractVar[Callable[[Experiment], Any] | None]
     """The leaf, or a tuple of leaves that share the value, of an experiment, as in `equinox.tree_at`."""
     update: eqx.AbstractVar[Callable[[Experiment, Value], Experiment] | None]
     """In the place of `where`: the experiment with the value put into it, for what is no single leaf."""
-    start: eqx.AbstractVar[Start | None]  # the first guess. Default: the value of the first experiment.
+    start: eqx.AbstractVar[Start | None]  # the first guess; None for the value of the first experiment
     prior: eqx.AbstractVar[AbstractPrior | None]  # prior knowledge of it
     unit: eqx.AbstractVar[str]  # the unit that tables show
-    only: eqx.AbstractVar[tuple[int, ...] | None]
-    """The numbers, from 0, of the experiments that it belongs to. Default: all."""
+    only: eqx.AbstractVar[tuple[int, ...] | None]  # numbers, from 0, of the experiments it belongs to; None for all
 
     def __check_init__(self):
         require_fields(self)
@@ -188,16 +187,18 @@ class AbstractParameter(eqx.Module):
         """z [-] at a value, with zero at `start`. Default: the difference of free values."""
         return self.free(value) - self.free(start)
 
-    @abc.abstractmethod
     def check(self, name: str, start: np.ndarray) -> None:
         """Raise a `ValueError` if the first guess does not lie within the bounds."""
+        lower, upper = self.domain
+        within = f"between its bounds {lower} and {upper}" if np.isfinite(upper) else "from positive numbers"
+        require((start > lower) & (start < upper), f"The parameter {name!r} must start {within}, got {start}.")
 
     def check_experiment(self, name: str, experiment: Experiment) -> None:
         """Raise a `ValueError` if it cannot be put into an experiment."""
 
     def room(self, start: Value, z: Value) -> tuple[Value, Value]:
         """How far the value can fall and rise until its bounds, each over its derivative by z [-], of the value's
-        shape. A straight line in the value meets the bound after so many units of z."""
+        shape: after so many units of z a straight line in the value meets the bound."""
         del start
         return jnp.full_like(z, jnp.inf), jnp.full_like(z, jnp.inf)
 
@@ -207,9 +208,8 @@ class AbstractParameter(eqx.Module):
 
     def first_guess(self, experiment: Experiment) -> Array:
         """The value that the search starts from."""
-        if self.start is not None:
-            return jnp.asarray(self.start, experiment.dtype)
-        return jnp.asarray(leaves_of(self.where, experiment)[0], experiment.dtype)
+        start = leaves_of(self.where, experiment)[0] if self.start is None else self.start
+        return jnp.asarray(start, experiment.dtype)
 
     def put(self, experiment: Experiment, value: Value) -> Experiment:
         """The experiment with this value."""
@@ -229,7 +229,7 @@ def leaves_of(where: Callable[[Experiment], Any] | None, experiment: Experiment)
 
 
 class _PlainParameter(AbstractParameter):
-    """A parameter whose values are those of leaves as they are."""
+    """A parameter whose values are put in as they are."""
 
     where: Callable[[Experiment], Any] | None = None
     update: Callable[[Experiment, Value], Experiment] | None = eqx.field(default=None, kw_only=True)
@@ -240,15 +240,17 @@ class _PlainParameter(AbstractParameter):
 
 
 class Unbounded(_PlainParameter):
-    """A parameter that may have any value, such as a velocity or an angle.
+    """A parameter that may have any value, such as a velocity or an angle. For all but the scale see `Positive`.
 
     Args:
-        where: the leaf, `lambda e: e.particles.v`, or a tuple of leaves that share the value.
         scale: a change that is large but not absurd. Default: the size of the first guess, or one if that is zero.
-        update, start, prior, unit, only: see `Positive`.
     """
 
     scale: Scalar | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self):
+        if self.scale is not None:
+            require_positive("Unbounded's scale", self.scale)
 
     def value(self, start: Value, z: Value) -> Value:
         return start + self._scale(start) * z
@@ -262,10 +264,6 @@ class Unbounded(_PlainParameter):
     def _scale(self, start: Value) -> Value | Scalar:
         size = jnp.abs(start).max()
         return jnp.where(size == 0, 1, size) if self.scale is None else self.scale
-
-    def check(self, name: str, start: np.ndarray) -> None:
-        if self.scale is not None:
-            require_positive(f"The scale of the parameter {name!r}", self.scale)
 
 
 class Positive(_PlainParameter):
@@ -298,22 +296,17 @@ class Positive(_PlainParameter):
         del start
         return jnp.ones_like(z), jnp.full_like(z, jnp.inf)
 
-    def check(self, name: str, start: np.ndarray) -> None:
-        require(start > 0, f"The parameter {name!r} must start from positive numbers, got {start}.")
-
 
 class Bounded(_PlainParameter):
-    """A parameter between two bounds, such as Poisson's ratio: lower + (upper − lower)/(1 + e^{−(z0 + z)}).
-
-    Args:
-        where: the leaf, `lambda e: e.scene.material.poisson_ratio`, or a tuple of leaves that share the value.
-        lower: lower bound.
-        upper: upper bound.
-        update, start, prior, unit, only: see `Positive`.
+    """A parameter between two bounds, such as Poisson's ratio: lower + (upper − lower)/(1 + e^{−(z0 + z)}). For all but
+    the bounds see `Positive`.
     """
 
     lower: float | int = eqx.field(static=True, default=0.0, converter=as_plain)
     upper: float | int = eqx.field(static=True, default=1.0, converter=as_plain)
+
+    def __check_init__(self):
+        require(self.lower < self.upper, f"Bounded's bounds must grow, got {self.lower} and {self.upper}.")
 
     @property
     def domain(self) -> tuple[float, float]:
@@ -332,12 +325,96 @@ class Bounded(_PlainParameter):
         logit = self.free(start) + z
         return 1 + jnp.exp(logit), 1 + jnp.exp(-logit)
 
-    def check(self, name: str, start: np.ndarray) -> None:
+
+class Field(AbstractParameter):
+    """A parameter that changes from place to place: its values on the nodes of a lattice, interpolated to the particles
+    where they start.
+
+        stiffness = mpm.Positive(lambda e: e.scene.material.youngs_modulus, prior=mpm.fitting.Smooth(0.5), unit="Pa")
+        result = mpm.fit(pull, {"E": mpm.fitting.Field(stiffness, mpm.fitting.Field.lattice_around(particles, 0.1))})
+
+    `result.values["E"]` has the values on the nodes, the fitted scene one for each particle. Nodes that the data do not
+    see need a prior, such as `Smooth`. A parameter of a law among several is a field over that law's particles.
+
+    Args:
+        of: what each value is: a `Positive`, `Bounded` or `Unbounded` parameter, its leaf one number, or one a
+            particle. With `update` it is given one value a particle, shape (p,).
+        lattice: the nodes; a window that holds all particles as they start, and neither follows nor is periodic.
+        kernel: B-spline of the interpolation: linear, by which values on nodes are those that the field takes there.
+        start: first guess, one number or one a node. Default: that of the parameter, or the mean of the leaf.
+    """
+
+    of: AbstractParameter
+    lattice: Grid
+    kernel: BSpline
+    start: Start | None
+
+    # All else is of the parameter that it spreads.
+    where, update, prior, unit, only, domain = (  # pyright: ignore
+        property(attrgetter(f"of.{name}")) for name in ("where", "update", "prior", "unit", "only", "domain")
+    )
+    value, coordinate, free, check, room, logarithmic = (  # pyright: ignore
+        property(attrgetter(f"of.{name}")) for name in ("value", "coordinate", "free", "check", "room", "logarithmic")
+    )
+
+    @checked
+    def __init__(
+        self, of: AbstractParameter, lattice: Grid, *, kernel: BSpline = BSpline(1), start: Start | None = None
+    ):
+        self.of, self.lattice, self.kernel = of, lattice, kernel
+        self.start = of.start if start is None else start
+
+    def __check_init__(self):
+        require(not isinstance(self.of, Field), "A Field is of a plain parameter, not of another Field.")
+        stays = not self.lattice.follow and not any(self.lattice.periodic)
+        require(stays, "The lattice of a Field must stay where it is: drop follow and periodic.")
+
+    @staticmethod
+    @checked
+    def lattice_around(particles: Particles, spacing: Scalar, *, kernel: BSpline = BSpline(1)) -> Grid:
+        """The smallest lattice of a spacing [m] that holds particles where they are."""
+        require_positive("The spacing of a Field's lattice [m]", spacing)
+        place = np.asarray(particles.x, float) / float(spacing)
+        require_finite("The particles' positions [m]", place)
+        ends = jnp.asarray([place.min(axis=0), place.max(axis=0)])
+        first, last = np.floor(np.asarray(kernel.base(ends))).astype(int).tolist()
+        shape = (max(b - a + kernel.order + 1, 4) for a, b in zip(first, last, strict=True))
+        return Grid(tuple(shape), spacing, origin=tuple(first))
+
+    def check_experiment(self, name: str, experiment: Experiment) -> None:
+        x = experiment.particles.x
+        what, lattice = f"The lattice of the field {name!r}", canonical(self.lattice, x.dtype)
+        require(lattice.dim == x.shape[1], f"{what} is {lattice.dim}-dimensional, the particles {x.shape[1]}.")
+        outside = ~np.asarray(in_window(self.kernel, lattice, lattice.window(x), x))
         require(
-            self.lower < self.upper,
-            f"The bounds of the parameter {name!r} must grow, got {self.lower} and {self.upper}.",
+            ~outside,
+            f"{what} must hold all particles as they start, but {int(outside.sum())} lie outside, the first at "
+            f"{np.asarray(x)[outside][:1].tolist()}: take Field.lattice_around(particles, spacing).",
         )
-        require(
-            (start > self.lower) & (start < self.upper),
-            f"The parameter {name!r} must start between its bounds {self.lower} and {self.upper}, got {start}.",
-        )
+
+    def first_guess(self, experiment: Experiment) -> Array:
+        start, shape = super().first_guess(experiment), self.lattice.shape
+        fits = self.start is None or start.shape in ((), shape)
+        require(fits, f"its start must have shape {shape}, or be one number")
+        return jnp.broadcast_to(start if start.shape == shape else start.mean(), shape)
+
+    def put(self, experiment: Experiment, value: Value) -> Experiment:
+        particles = experiment.particles
+        values = self.on_particles(particles.x, value)
+        if self.update is not None:
+            return self.update(experiment, values)
+        where, parts = partial(leaves_of, self.where), []
+        for number in range(len(where(experiment))):
+            mark = object()
+            marked = eqx.tree_at(lambda e, k=number: where(e)[k], experiment, mark)
+            each = zip(marked.scene.laws, particles.groups, strict=True)
+            of_laws = [group.rows for law, group in each if any(leaf is mark for leaf in jax.tree.leaves(law))]
+            # The particles to which the leaf belongs: those of its law, or all.
+            parts.append(values[slice(*(of_laws[-1] if of_laws else (0, particles.count)))])
+        return eqx.tree_at(where, experiment, tuple(parts))
+
+    def on_particles(self, x: ParticleVector, value: Value) -> ParticleScalar:
+        """The field at positions x [m], shape (p, d), from its values on the nodes."""
+        lattice = canonical(self.lattice, x.dtype)
+        stencil = make_stencil(self.kernel, SplineGradient(), lattice, lattice.window(x), x)
+        return gather(stencil, value.reshape(-1, 1))[0][0]

@@ -71,12 +71,8 @@ class FitProblem(eqx.Module):
                 f"The parameter {name!r} must name a number of the experiment e, such as "
                 f"lambda e: e.scene.material.youngs_modulus: {shortened(str(error), 200)}."
             ) from None
-        before, after = jax.tree.leaves(experiment), jax.tree.leaves(changed)
-        same = len(before) == len(after) and all(
-            np.shape(a) == np.shape(b) and np.array_equal(a, b)
-            for a, b in zip(before, after, strict=True)
-            if eqx.is_array_like(a)
-        )
+        before, after = (list(filter(eqx.is_array_like, jax.tree.leaves(tree))) for tree in (experiment, changed))
+        same = len(before) == len(after) and all(map(np.array_equal, before, after))
         require(not same, f"The parameter {name!r} changes nothing of the experiment: name a number that it has.")
         parameter.check(name, start)
         if parameter.prior is not None:
@@ -104,6 +100,17 @@ class FitProblem(eqx.Module):
     def points(self) -> int:
         """How many numbers were measured."""
         return sum(o.count for o in self.observations)
+
+    @property
+    def measured(self) -> int:
+        """How many residuals are of observations, zero of what was not measured among them."""
+        return sum(o.data.size for o in self.observations)
+
+    @property
+    def rows(self) -> tuple[slice, ...]:
+        """The residuals of each observation; those of priors follow."""
+        ends = itertools.accumulate((o.data.size for o in self.observations), initial=0)
+        return tuple(itertools.starmap(slice, itertools.pairwise(ends)))
 
     @property
     def fixed_by_priors(self) -> int:
@@ -141,34 +148,19 @@ class FitProblem(eqx.Module):
         return tuple(parameter.logarithmic for parameter in self.owners)
 
     @eqx.filter_jit
-    def size_of_data(self, sigmas: Sigmas) -> Array:
-        """√Σ (data/σ)², the size of what the residuals are the difference of [-]."""
+    def rounding_of_data(self, sigmas: Sigmas) -> Array:
+        """ε √Σ (data/σ)², the rounding of what the residuals are the difference of [-]."""
         each = zip(self.observations, sigmas, strict=True)
         ratios = (jnp.asarray(o.data, self.dtype) / jnp.asarray(sigma, self.dtype) for o, sigma in each)
-        return jnp.sqrt(sum((jnp.nansum(ratio**2) for ratio in ratios), jnp.zeros((), self.dtype)))
-
-    def rounding(self, cost: Array, sigmas: Sigmas) -> Array:
-        """The part of ½ Σ r² that may be rounding: each residual has that of the data's size, ε √Σ (data/σ)² [-]."""
-        noise = float(jnp.finfo(self.dtype).eps) * self.size_of_data(sigmas).astype(cost.dtype)
-        return jnp.sqrt(2 * cost) * noise + noise**2 + float(jnp.finfo(cost.dtype).eps) * cost
+        squares = sum((jnp.nansum(ratio**2) for ratio in ratios), jnp.zeros((), self.dtype))
+        return float(jnp.finfo(self.dtype).eps) * jnp.sqrt(squares)
 
     def misfit(self, cost: float) -> float:
         """Root mean square of the residuals of the measured numbers, in units of σ, or of the size of the data."""
         return float(np.sqrt(2 * cost / self.points))
 
-    @property
-    def measured(self) -> int:
-        """How many residuals are of observations."""
-        return sum(o.data.size for o in self.observations)
-
-    @property
-    def rows(self) -> tuple[slice, ...]:
-        """The residuals of each observation; those of priors follow."""
-        ends = np.cumsum([0, *(o.data.size for o in self.observations)])
-        return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(ends))
-
     def unrestricted(self, z: Float[Array, "f"]) -> Float[Array, "n"]:
-        """The coordinates of all parameters, one after the other."""
+        """The coordinates of all parameters, where a profile holds one."""
         return z
 
     def values(self, z: Coordinates) -> tuple[Array, ...]:
@@ -213,7 +205,7 @@ class FitProblem(eqx.Module):
 
     def residuals(self, z: Coordinates, sigmas: Sigmas, adjoint: Any) -> tuple[Array, Array]:
         """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does
-        not reach a measurement; and what tangent solves report (see `Run.report`). `adjoint` is how diffrax
+        not reach a measurement; and the reports of tangent solves (`Run.report`). `adjoint` is how diffrax
         differentiates, None reverse mode within the memory."""
         parts, reports, noise = [], [], iter(sigmas)
         for experiment in self.at(z):
@@ -230,9 +222,8 @@ class FitProblem(eqx.Module):
         return jnp.concatenate([parameter.prior_residuals(value) for parameter, value in each])
 
     def gradient(self, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array, Coordinates]:
-        """The residuals r, ½ Σ r² and its derivative by the coordinates, by one pass of reverse mode: its cost does not
-        grow with their number. NaN where a simulation met a fault, the derivative also where an adjoint solve did not
-        converge."""
+        """The residuals r, ½ Σ r² and its derivative by the coordinates, by one pass of reverse mode, whatever their
+        number. NaN where a simulation met a fault, the derivative also where an adjoint solve did not converge."""
 
         def cost(z: Coordinates) -> tuple[Array, Array]:
             r = self.residuals(z.astype(self.dtype), sigmas, None)[0].astype(z.dtype)
@@ -244,8 +235,7 @@ class FitProblem(eqx.Module):
     def explain(
         self, z: Coordinates, failure: str = "What is observed of the simulation at the first guess is not finite."
     ) -> NoReturn:
-        """Raise the error that says why a fit fails at z: of the simulation, or of an observation that it does not
-        reach; else with `failure`."""
+        """Raise the error of the simulation at z, or of an observation that it does not reach; else `failure`."""
         for experiment in self.at(z):
             run = experiment.run()
             for observation, seen in zip(experiment.observations, run.observed, strict=True):
@@ -256,15 +246,13 @@ class FitProblem(eqx.Module):
         self, z: Coordinates, sigmas: Sigmas, mode: Literal["forward", "reverse"] | None = None
     ) -> tuple[Array, Array]:
         """The residuals and their derivative by the coordinates, shape (m, n). NaN where a tangent or adjoint solve did
-        not converge. The mode is "forward", the simulation once and beside it, in the same pass, the tangents of the
-        coordinates, or "reverse", a pass back for each measured number, as many at once as the memory holds; default:
-        what costs less."""
+        not converge. The mode is "forward", a tangent of each coordinate beside the simulation, or "reverse", a pass
+        back for each measured number, as many at once as the memory holds; default: the cheaper one."""
         if (self.cheaper_mode if mode is None else mode) == "reverse":
             r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
-            units = jnp.eye(self.measured, len(r), dtype=r.dtype)  # priors need no simulation
+            units = np.eye(self.measured, len(r), dtype=r.dtype)  # priors need no simulation
             _, (rows,) = in_batches(lambda unit: ((), pull(unit)), units, self.at_once)
             return r, jnp.concatenate([rows, jax.jacfwd(self.prior_residuals)(z)])
-
         evaluate = partial(self.residuals, sigmas=sigmas, adjoint=diffrax.ForwardMode())
         (r, _), (columns, unsolved) = linearised(evaluate, z, self.at_once)
         return r, jnp.where((unsolved != 0).any(), jnp.nan, columns.T)
@@ -288,7 +276,7 @@ class FitProblem(eqx.Module):
 def _valued(
     parameters: tuple[AbstractParameter, ...], starts: tuple[Array, ...], z: Coordinates
 ) -> tuple[tuple[Array, ...], Float[Array, "n"], Float[Array, "2 n"]]:
-    """The value of each parameter; the same one after the other; and their room: one program, which knows no scene."""
+    """The value of each parameter, all numbers in a row, and their room: one program, which knows no scene."""
     parts = jnp.split(z, np.cumsum([start.size for start in starts])[:-1])
     each = [
         (p, start, part.reshape(start.shape).astype(start.dtype))
@@ -307,15 +295,14 @@ def size_of(tree: Any) -> int:
 
 
 def linearised(function: Callable[[Coordinates], Any], z: Coordinates, at_once: int) -> tuple[Any, Any]:
-    """The value of a function, and its derivative by each coordinate, with a leading axis n: by forward mode, so many
-    tangents at once."""
-    units = jnp.eye(len(z), dtype=z.dtype)
+    """A function's value, and its derivatives by the coordinates, a leading axis n, `at_once` of them together."""
+    units = np.eye(len(z), dtype=z.dtype)
     return in_batches(lambda tangent: jax.jvp(function, (z,), (tangent,)), units, at_once)
 
 
 def in_batches(function: Callable[[Any], tuple[Any, Any]], units: Any, at_once: int) -> tuple[Any, Any]:
-    """A function of each row of arrays `units`, shapes (k, ...), by batches of `at_once` rows. It returns two pytrees:
-    one that is the same for all rows, and one of each row, which gets a leading axis k."""
+    """A function of each row of `units`, arrays (k, ...), by batches of `at_once` rows. It returns two pytrees: one
+    that all rows share, and one of each row, which gets a leading axis k."""
     count = len(jax.tree.leaves(units)[0])
     batches = -(-count // at_once)
     size = -(-count // batches)
@@ -329,7 +316,7 @@ def in_batches(function: Callable[[Any], tuple[Any, Any]], units: Any, at_once: 
     if batches == 1:
         return batch(units)
 
-    def split(a: Array) -> Array:
+    def split(a: Any) -> Array:
         padded = jnp.concatenate([a, jnp.zeros((batches * size - count, *a.shape[1:]), a.dtype)])
         return padded.reshape(batches, size, *a.shape[1:])
 

@@ -48,24 +48,22 @@ class AbstractOptimiser(eqx.Module):
         what it knows of that place. The first one evaluates where it starts. A step at which a simulation fails must
         not be taken."""
 
+    @abc.abstractmethod
+    def has_converged(self, state: Any, seen: Evaluation) -> bool:
+        """Whether the search is at a minimum."""
+
     def place(self, problem: FitProblem, state: Any) -> Coordinates | None:
         """The one place at which the next iteration asks the problem for residuals and Jacobian, where that is all it
-        asks for: they are then computed by programs of their own. Default: None, an iteration is one program."""
-        del problem, state
-        return None
+        asks for: programs of their own then compute them. Default: None, an iteration is one program."""
 
     def directed(self, z: Coordinates, state: Any, seen: Evaluation) -> Any:
         """The state for the next iteration, outside of what is compiled. Default: as it is."""
         del z, seen
         return state
 
-    @abc.abstractmethod
-    def has_converged(self, state: Any, seen: Evaluation) -> bool:
-        """Whether the search is at a minimum."""
-
     def distance(self, state: Any, seen: Evaluation) -> float:
-        """How far the search is from converged, as a multiple of where it ends; NaN if that is not known, which is the
-        default. The time left is estimated from how fast it falls."""
+        """How far the search is from converged, as a multiple of where it ends, by which the time left is estimated;
+        NaN if that is not known, which is the default."""
         del state, seen
         return float("nan")
 
@@ -125,8 +123,8 @@ def search_many(
 ) -> dict[int, Search]:
     """The least Σ r² of searches that differ in where they start or in their data, by their numbers.
 
-    One compiled program makes an iteration of `batch` searches together, by `jax.vmap`. A search that is done leaves
-    its place to the next one that waits. One that fails ends alone. An interruption (Ctrl-C) ends all where they are.
+    One compiled program makes an iteration of `batch` searches together. A search that is done leaves its place to the
+    next one that waits. One that fails ends alone. An interruption (Ctrl-C) ends all where they are.
 
     Args:
         problems: a problem and the noise of its observations for each number, or one for all searches.
@@ -143,15 +141,17 @@ def search_many(
         begun: called with the noise of a search and the evaluation where it starts, unless it fails there.
         report: called with the noise and the search after each iteration.
     """
-    stacked = _stacked(problems)
-    waiting, done = deque(starts), dict(done or {})
-    before = len(done)
-    running: dict[int, Search | None] = {} if state is None else {waiting.popleft(): state}
+    waiting, done, stacked = deque(starts), dict(done or {}), _stacked(problems)
+    before, unseen = len(done), Evaluation(jnp.zeros(()), jnp.zeros(0))
+    running: dict[int, Search] = {} if state is None else {waiting.popleft(): state}
 
-    def end(k: int, search: Search, **outcome: Any) -> None:
+    def problem_of(k: int) -> tuple[FitProblem, Sigmas]:
+        return problems[0 if len(problems) == 1 else k]
+
+    def end(k: int, **outcome: Any) -> None:
         """End a search; where it did not fail, with the residuals and the Jacobian."""
+        search, (problem, sigmas) = running[k], problem_of(k)
         if "failure" not in outcome:
-            problem, sigmas = problems[0 if len(problems) == 1 else k]
             z, r, J = jnp.asarray(search.z).astype(problem.dtype), search.seen.residuals, search.seen.jacobian
             if r is None or J is None:
                 r, J = jacobian(problem, z, sigmas)
@@ -168,88 +168,78 @@ def search_many(
 
     try:
         while True:
-            states = {k: search for k, search in running.items() if search is not None}
-            for k, search in states.items():
-                spent = len(search.history) >= optimiser.max_steps
+            iterated = list(running)
+            for k, search in list(running.items()):
                 if not np.isfinite(search.cost):
-                    end(k, search, failure="the simulation fails where it starts, or does not reach the data")
+                    end(k, failure="the simulation fails where it starts, or does not reach the data")
                 elif not np.isfinite(search.history[-1].gradient):
-                    end(k, search, failure=NO_DERIVATIVE)
+                    end(k, failure=NO_DERIVATIVE)
                 elif settled(search.history) or optimiser.has_converged(search.inner, search.seen):
-                    end(k, search, converged=True)
-                elif spent or (settling == 0 and optimiser.has_stalled(search.inner)):
-                    end(k, search)  # where searches settle, one that stalls goes on, and soon has settled
+                    end(k, converged=True)
+                elif len(search.history) >= optimiser.max_steps or (
+                    settling == 0 and optimiser.has_stalled(search.inner)
+                ):
+                    end(k)  # where searches settle, one that stalls goes on, and soon has settled
             if joining > 0:
-                left = {k: states[k] for k in running}
-                last = {k: s.history[-1] for k, s in (done | left).items() if not s.failure and s.joined is None}
-                for k, search in left.items():
+                last = {k: s.history[-1] for k, s in (done | running).items() if not s.failure and s.joined is None}
+                for k in list(running):
                     better = (n for n, i in last.items() if i.cost < last[k].cost)
                     near = [n for n in better if (np.abs(last[n].z - last[k].z) <= joining).all()]
                     if near:
-                        end(k, search, joined=near[0])
-            if states:
+                        end(k, joined=near[0])
+            if iterated:
                 progress(len(done) - before, len(starts))
-            if any(enough(done[k]) for k in states if k in done):
+            if any(enough(done[k]) for k in iterated if k in done):
                 waiting.clear()
             while waiting and len(running) < batch:
-                running[waiting.popleft()] = None
+                k = waiting.popleft()
+                problem, sigmas = problem_of(k)
+                z = jnp.asarray(starts[k], float)  # optimistix's own numbers are of JAX's default precision
+                running[k] = Search(z, begin(problem, optimiser, z, sigmas), unseen, ())
             if not running:
                 return dict(sorted(done.items()))
-            states = _iterated(problems, stacked, optimiser, starts, running, batch)
-            running = {**states}
-            for k, search in states.items():
+            running = _iterated(running, problem_of, stacked, optimiser, batch)
+            for k, search in running.items():
                 if np.isfinite(search.cost) and np.isfinite(search.history[-1].gradient):
-                    _, sigmas = problems[0 if len(problems) == 1 else k]
+                    _, sigmas = problem_of(k)
                     if len(search.history) == 1:
                         begun(sigmas, search.seen)
                     report(sigmas, search)
     except KeyboardInterrupt:
-        for k, search in list(running.items()):
-            if search is not None:
-                end(k, search, interrupted=True)
-    none = Search(jnp.zeros(0), None, Evaluation(jnp.zeros(()), jnp.zeros(0)), ())
-    begun_none = {k: none._replace(interrupted=True, failure=_NOT_BEGUN) for k in starts}
-    return dict(sorted((begun_none | done).items()))
+        for k in [k for k, search in running.items() if search.history]:
+            end(k, interrupted=True)
+    left = Search(jnp.zeros(0), None, unseen, (), interrupted=True, failure="was not begun: the search was interrupted")
+    return dict(sorted((dict.fromkeys(starts, left) | done).items()))
 
 
 def _iterated(
-    problems: Sequence[tuple[FitProblem, Sigmas]],
+    running: Mapping[int, Search],
+    problem_of: Callable[[int], tuple[FitProblem, Sigmas]],
     stacked: tuple[Any, Any],
     optimiser: AbstractOptimiser,
-    starts: Mapping[int, Any],
-    running: Mapping[int, Search | None],
     batch: int,
 ) -> dict[int, Search]:
     """One iteration of several searches, compiled for `batch` of them: free places repeat the first one."""
-    before: dict[int, tuple[Coordinates, Any, tuple[Iteration, ...]]] = {}
-    for k, search in running.items():
-        if search is None:
-            problem, sigmas = problems[0 if len(problems) == 1 else k]
-            z = jnp.asarray(starts[k], float)  # optimistix's own numbers are of JAX's default precision
-            before[k] = z, begin(problem, optimiser, z, sigmas), ()
-        else:
-            before[k] = search.z, search.inner, search.history
+    searches = list(running.values())
     if batch == 1:  # the program of a single search, which compiles in less time than a batch of one
-        (k,), ((z, inner, _),) = before, before.values()
-        problem, sigmas = problems[0 if len(problems) == 1 else k]
-        ends = [iterate(problem, optimiser, z, sigmas, inner)]
+        (k,), (search,) = running, searches
+        problem, sigmas = problem_of(k)
+        ends = [iterate(problem, optimiser, search.z, sigmas, search.inner)]
     else:
-        lanes = [*range(len(before)), *[0] * (batch - len(before))]
-        places, inners, _ = zip(*before.values(), strict=True)
-        parts = [eqx.partition(inner, eqx.is_array) for inner in inners]
-        rows = jax.tree.map(lambda *a: np.stack([np.asarray(a[lane]) for lane in lanes]), *(a for a, _ in parts))
-        varying = jax.tree.map(lambda a: a[np.array(list(before))[lanes]], stacked[0])
-        z = np.stack([np.asarray(place) for place in places])[lanes]
+        lanes = np.array([*range(len(searches)), *[0] * (batch - len(searches))])
+        parts = [eqx.partition(search.inner, eqx.is_array) for search in searches]
+        z = np.stack([np.asarray(search.z) for search in searches])[lanes]
+        rows = jax.tree.map(lambda *a: np.stack([np.asarray(each) for each in a])[lanes], *(a for a, _ in parts))
+        varying = jax.tree.map(lambda a: a[np.array(list(running))[lanes]], stacked[0])
         z, inner, seen = iterate_together(varying, stacked[1], optimiser, z, eqx.combine(rows, parts[0][1]))
         arrays, rest = eqx.partition(inner, eqx.is_array)
         whole = jax.tree.map(np.asarray, (z, arrays, seen))
-        each = [jax.tree.map(lambda a, i=lane: a[i], whole) for lane in range(len(before))]
+        each = [jax.tree.map(lambda a, i=lane: a[i], whole) for lane in range(len(searches))]
         ends = [(jnp.asarray(z), eqx.combine(part, rest), seen) for z, part, seen in each]
     after = {}
-    for (k, (*_, history)), (z, inner, seen) in zip(before.items(), ends, strict=True):
-        cost, slope = float(seen.cost), float(np.abs(seen.gradient).max())
-        moved = not history or cost != history[-1].cost
-        iteration = Iteration(len(history), cost, slope, moved, np.asarray(z))
+    for (k, search), (z, inner, seen) in zip(running.items(), ends, strict=True):
+        cost, slope, history = float(seen.cost), float(np.abs(seen.gradient).max()), search.history
+        iteration = Iteration(len(history), cost, slope, not history or cost != history[-1].cost, np.asarray(z))
         after[k] = Search(z, optimiser.directed(z, inner, seen), seen, (*history, iteration))
     return after
 
@@ -329,6 +319,8 @@ def iterate_alone(
     return optimiser.iterate(problem, z, sigmas, inner)
 
 
+# A batch stays one program, though three would serve other observations too: jax dispatches one program in a
+# millisecond, three under its transformations in ten, which a bootstrap of short runs pays hundreds of times.
 @eqx.filter_jit
 def iterate_together(
     varying: Any, common: Any, optimiser: AbstractOptimiser, z: np.ndarray | Array, inner: Any
@@ -347,17 +339,12 @@ def jacobian(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> tuple[Array
     """The residuals and their Jacobian, compiled."""
     if problem.cheaper_mode == "forward" and (kept := parts_kept(problem, 1 + problem.size)) is not None:
         at = evaluated(problem, z, z, sigmas, kept)
-        return at.r, at.J
+        return at.r, jnp.asarray(at.J)
     return _jacobian(problem, z, sigmas)
 
 
-@eqx.filter_jit
-def _jacobian(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array]:
-    """See `jacobian`: in one program."""
-    return problem.jacobian(z, sigmas)
-
+_jacobian = eqx.filter_jit(lambda problem, z, sigmas: problem.jacobian(z, sigmas))
 
 NO_DERIVATIVE = "there is no derivative"
-_NOT_BEGUN = "was not begun: the search was interrupted"
 _MOVES = 3  # how many moves must have lowered the cost by little
 _ITERATIONS = 6  # how many iterations must have lowered the cost by little
