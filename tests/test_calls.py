@@ -26,7 +26,7 @@ MADE_BY_THE_PACKAGE = """Bootstrap EnsembleFit FitResult
 Profile RefinedFit Run Screening Markers StressStretch"""
 """Classes of what the package returns, or what a step is made of."""
 WITHOUT_ARGUMENTS = "CentreOfMass backend"
-BY_THEMSELVES = "register read_columns FitProblem Columns after read_arrays stated_unit measured_components"
+BY_THEMSELVES = "register read_columns FitProblem Columns after read_arrays stated_unit"
 
 
 ROOT = Path(__file__).parents[1]

@@ -15,7 +15,7 @@ from shell import refused, shell
 import mpmjax as mpm
 from mpmjax.checks import warn
 from mpmjax.cli._fit_file import read_fit
-from mpmjax.fitting import read_columns
+from mpmjax.fitting import _result, read_columns
 from mpmjax.fitting._columns import stated_unit
 from mpmjax.simulation import _simulate
 
@@ -94,7 +94,8 @@ def bar(tmp_path_factory):
 def test_the_command_fits_prints_and_writes(bar, monkeypatch):
     """A table on standard output, progress and what is said of the fitted run beside it, a picture and its numbers."""
     inaccurate = lambda run: warn(f"inaccurate at E = {float(run.scene.material.youngs_modulus):.3g}")  # noqa: E731
-    monkeypatch.setattr(_simulate, "warn_of_inaccuracy", inaccurate)
+    monkeypatch.setattr(_result, "warn_of_inaccuracy", inaccurate)
+    monkeypatch.setattr(_simulate, "warn_of_inaccuracy", lambda run: warn("a run besides those of the search"))
     code, out, err = shell("fit", bar / "bar.toml", "--plot", bar / "fit.png")
     assert code == 0, err
     found = re.search(r"E \[Pa\]\s+(\S+) ± (\S+)", out)
@@ -103,6 +104,7 @@ def test_the_command_fits_prints_and_writes(bar, monkeypatch):
     assert re.search(r"mu\s+\S+ ± ", out)
     assert "misfit" in err
     assert "warning: inaccurate at E = 1.2e+05" in err
+    assert "a run besides" not in err
     assert (bar / "fit.png").stat().st_size > 10_000
     numbers = json.loads((bar / "fit.json").read_text())
     assert numbers["estimates"][0]["label"] == "E"

@@ -10,7 +10,7 @@ import pytest
 from test_fit import DT, NOISE, RATIO, experiment, tracks
 
 import mpmjax as mpm
-from mpmjax.fitting._misfit import shape_of
+from mpmjax.fitting._estimate import shape_of
 
 E, SIDE = 7e4, 0.4
 

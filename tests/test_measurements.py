@@ -13,7 +13,6 @@ import mpmjax as mpm
 from mpmjax.cli._fit_file import read_fit
 from mpmjax.cli._scene_file import read_simulation
 from mpmjax.fitting import Prediction
-from mpmjax.fitting._picture import draw_observation
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.state import with_state
 
@@ -115,7 +114,7 @@ def test_a_picture_shows_the_columns_of_the_file(pushed):
     for axis, kind in zip(axes, ("ForceDisplacement", "Force"), strict=True):
         data = observations[kind].data
         flat = Prediction(data, data, data, data, None, None, None, 0.95)
-        draw_observation(axis, observations[kind], flat, np.inf)
+        observations[kind].draw(axis, flat, np.inf)
         assert axis.get_legend_handles_labels()[1] == ["95 % of the mean", "fit", "measured"]
     (dots,) = (line for line in axes[0].lines if line.get_label() == "measured")
     np.testing.assert_allclose(np.sort(dots.get_xydata(), axis=0), np.sort(rows, axis=0), atol=1e-12)

@@ -258,8 +258,8 @@ def fit_scene(
             _print_error(f"{len(drawn)} of {len(wanted)} profiles are done.")
     for each in drawn:
         print(each)
-    for experiment in () if result.interrupted else result.experiments:
-        experiment.run()  # for its warnings: the compiled runs of a fit give none
+    if not result.interrupted:
+        result.warn_of_runs()
     print(f"{iterations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all", flush=True)
     report = whole, tuple(drawn), predict_observations(result, whole)
     numbers = write_fit(outcome, plot.with_suffix(".json"), *report)

@@ -41,7 +41,6 @@ from mpmjax.fitting._parameter import (
     Smooth as Smooth,
     Unbounded as Unbounded,
 )
-from mpmjax.fitting._picture import measured_components as measured_components
 from mpmjax.fitting._prediction import (
     Bootstrap as Bootstrap,
     bootstrap as bootstrap,

@@ -6,7 +6,6 @@ are transformed from outside: `jax.jvp` and `jax.vmap` then spare all numbers th
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import diffrax
@@ -17,7 +16,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float
 from mpmjax.fitting._experiment import AbstractObservation, Experiment, observe_all
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas, linearised, size_of
+from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas, in_batches, size_of
 from mpmjax.simulation import Run, simulate
 from mpmjax.state import Particles, Scene, state_of, with_state
 
@@ -68,12 +67,14 @@ def _kept(problem: FitProblem) -> tuple[Kept, ...]:
     return tuple(kept)
 
 
-def staged(problem: FitProblem, z: Coordinates, sigmas: Sigmas, kept: tuple[Kept, ...]) -> tuple[Array, Array]:
-    """`FitProblem.residuals` by forward mode, in three programs; `kept` as of `parts_kept`."""
+def staged(
+    problem: FitProblem, z: Coordinates, sigmas: Sigmas, kept: tuple[Kept, ...]
+) -> tuple[tuple[Array, Array], tuple[Run, ...]]:
+    """`FitProblem.residuals` by forward mode, in three programs, and the runs; `kept` as of `parts_kept`."""
     experiments, of_priors = _put(problem, z)
     each = zip(experiments, kept, strict=True)
     runs = tuple(_run((e.scene, e.particles, e.method), part, e.t1, e.dt) for e, part in each)
-    return _compared(tuple(e.observations for e in experiments), runs, kept, sigmas, of_priors)
+    return _compared(tuple(e.observations for e in experiments), runs, kept, sigmas, of_priors), runs
 
 
 @eqx.filter_jit
@@ -118,6 +119,7 @@ class Evaluated(eqx.Module):
     r: Float[Array, "m"]
     J: Float[Array, "m n"] | Float[np.ndarray, "m n"]
     rooms: tuple[Float[Array, "2 n"], ...]  # see `FitProblem.room`: at the place, and where the search is
+    runs: tuple[Run, ...] = ()  # runs of the experiments, without what was observed
 
     @property
     def dtype(self) -> Any:
@@ -139,9 +141,20 @@ def evaluated(
 ) -> Evaluated:
     """Residuals and Jacobian at a place, of a search that is at z, by forward mode; `kept` as of `parts_kept`."""
     place, z = (jnp.asarray(a, problem.dtype) for a in (place, z))
-    (r, _), (columns, unsolved) = linearised(partial(staged, problem, sigmas=sigmas, kept=kept), place, len(place))
-    J = np.where(np.asarray(unsolved).any(), np.nan, np.asarray(columns).T)
-    return Evaluated(place, r, J.astype(r.dtype), (problem.room(place), problem.room(z)))
+    rest = []
+
+    def along(tangent: Any) -> tuple[Any, Any]:
+        def residuals(z: Coordinates) -> tuple[Any, Any]:
+            both, runs = staged(problem, z, sigmas, kept)
+            arrays, rest[:] = eqx.partition(tuple(replace(run, observed=None) for run in runs), eqx.is_array)
+            return both, arrays
+
+        both, changes, arrays = jax.jvp(residuals, (place,), (tangent,), has_aux=True)
+        return (both, arrays), changes
+
+    ((r, _), runs), (columns, unsolved) = in_batches(along, np.eye(len(place), dtype=place.dtype), len(place))
+    J = np.where(np.asarray(unsolved).any(), np.nan, np.asarray(columns).T).astype(r.dtype)
+    return Evaluated(place, r, J, (problem.room(place), problem.room(z)), eqx.combine(runs, tuple(rest)))
 
 
 def costs_at(
@@ -159,7 +172,7 @@ def costs_at(
         if kept is None:
             r = _residuals_at_once(problem, rows, sigmas)
         else:
-            r = jax.vmap(lambda z: staged(problem, z, sigmas, kept)[0])(rows)
+            r = jax.vmap(lambda z: staged(problem, z, sigmas, kept)[0][0])(rows)
         costs[first : first + batch] = (np.asarray(r) ** 2).sum(axis=1)[: len(points) - first] / 2
         progress(min(first + batch, len(points)), len(points))
     return costs

@@ -1,6 +1,7 @@
 """An experiment: a scene, how it is run, and what was measured of it."""
 
 import abc
+import itertools
 from typing import Any
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import as_floats, canonical, checked, require, require_fields, require_finite, require_positive
+from mpmjax.fitting._uncertainty import Prediction
 from mpmjax.simulation import Run, number_of_steps, simulate
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit
@@ -129,6 +131,58 @@ class AbstractObservation(eqx.Module):
     def count(self) -> int:
         """How many numbers were measured."""
         return int(np.isfinite(self.data).sum())
+
+    @property
+    def picture(self) -> Shown:
+        """How pictures show it: by `shown`, if it has that field."""
+        return getattr(self, "shown", Shown())
+
+    @property
+    def components(self) -> list[tuple[int, str]]:
+        """Numbers and names of the components, in C order, of which anything was measured."""
+        shape = self.data.shape[1:]
+        measured = np.isfinite(self.data.reshape(len(self.data), -1)).any(axis=0)
+        names = [list(map(str, range(n))) for n in shape]
+        if shape and shape[-1] <= 3:
+            names[-1] = list("xyz"[: shape[-1]])
+        labels = self.picture.columns or tuple(", ".join(of) for of in itertools.product(*names))
+        return [(k, labels[k]) for k in np.flatnonzero(measured).tolist()]
+
+    def draw(self, axis: Any, predicted: Prediction, last: float) -> None:
+        """Draw data, fit and bands in the data's units; the data that were fitted end at the abscissa `last`."""
+        shown, (name, against) = self.picture, self.against
+        order = np.argsort(against)
+        x = shown.along(against[order])
+
+        def columns(of: Any) -> np.ndarray:
+            return np.broadcast_to(np.asarray(of, float), predicted.value.shape).reshape(len(x), -1)[order] / shown.unit
+
+        data, model, lower, upper = map(columns, (self.data, predicted.value, predicted.lower, predicted.upper))
+        level = f"{100 * predicted.level:g} %"
+        says = {"measured": "measured", "fit": "fit", "mean": f"{level} of the mean"}
+        says |= {"new": f"{level} of new measurements"}
+        if len(self.components) > 1:  # a colour for each component, by its name, and grey for the rest
+            axis.plot([], [], "o", color="0.4", markersize=3.5, label=says["measured"])
+            axis.plot([], [], color="0.4", linewidth=1.2, label=says["fit"])
+            axis.fill_between([], [], [], color="0.4", alpha=0.35, linewidth=0, label=says["mean"])
+            says = {}
+        for number, (k, label) in enumerate(self.components[:_MOST_LINES]):
+            band: dict[str, Any] = {"color": f"C{number}", "linewidth": 0}
+            if predicted.new_lower is not None:
+                new = columns(predicted.new_lower)[:, k], columns(predicted.new_upper)[:, k]
+                axis.fill_between(x, *new, alpha=0.12, label=says.get("new"), **band)
+            axis.fill_between(x, lower[:, k], upper[:, k], alpha=0.35, label=says.get("mean"), **band)
+            axis.plot(x, model[:, k], color=f"C{number}", linewidth=1.2, label=says.get("fit"))
+            dots: dict[str, Any] = {"markersize": 3.5, "markeredgecolor": "white", "markeredgewidth": 0.5}
+            axis.plot(x, data[:, k], "o", color=f"C{number}", label=says.get("measured", label), **dots)
+        count = len(self.components)
+        title = f"{_MOST_LINES} of {count} shown" if count > _MOST_LINES else None
+        axis.legend(fontsize=7, frameon=False, title=title)
+        if against.max() > last:
+            axis.axvline(float(shown.along(np.array([last]))[0]), color="0.6", linewidth=0.8, linestyle="--")
+            axis.set_title("fitted to the dashed line, predicted beyond", fontsize=9)
+        axis.set(xlabel=shown.x or name, ylabel=shown.y or self.name)
+        axis.spines[["top", "right"]].set_visible(False)
 
     def scale(self) -> float:
         """The size of the data, which stands for an unknown σ until it is estimated."""
@@ -262,4 +316,5 @@ def observe_all(observations: tuple[AbstractObservation, ...], scene: Scene, par
     return tuple(observation.observe(scene, particles) for observation in observations)
 
 
+_MOST_LINES = 6  # components of an observation that are drawn
 _ON_A_STEP = 1e-6  # part of a step by which a time may lie after it and is on it

@@ -85,7 +85,7 @@ def recorded(
                     if last is not None:
                         state = jax.tree.leaves(eqx.filter(last.inner, eqx.is_array))
                         arrays |= {f"resume/state/{k}": np.asarray(leaf) for k, leaf in enumerate(state)}
-                        seen = {name: a for name, a in last.seen._asdict().items() if a is not None}
+                        seen = {name: a for name, a in last.seen._asdict().items() if a is not None and name != "runs"}
                         arrays |= {f"resume/seen/{name}": np.asarray(a) for name, a in seen.items()}
                     for name, array in arrays.items():  # with checksums where there are data
                         checked = {"chunks": array.shape, "fletcher32": True} if array.ndim and array.size else {}
@@ -161,7 +161,8 @@ def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: d
             each: Any = [(n, Iteration(*i, z)) for (n, *i, _), z in zip(rows, places, strict=True)]  # pyright: ignore
             earlier, history = (tuple(i for n, i in each if (n == rounds - 1) is last) for last in (False, True))
             names = [name for name in Evaluation._fields if f"resume/seen/{name}" in arrays]
-            seen = Evaluation(**{name: jnp.asarray(arrays[f"resume/seen/{name}"]) for name in names})
+            parts: dict[str, Any] = {name: jnp.asarray(arrays[f"resume/seen/{name}"]) for name in names}
+            seen = Evaluation(**parts)
             like = eqx.filter_eval_shape(begin, problem, optimiser, jnp.zeros(problem.size), noise[-1])
             shapes, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
             leaves, tree = jax.tree.flatten(shapes)

@@ -55,16 +55,15 @@ def predict(
     Raises:
         ValueError: there is no such experiment; a run in `of` that has no forward derivative; a level that is none.
     """
-    problem = result.problem
-    count = len(problem.experiments)
+    count = len(result.problem.experiments)
     if isinstance(experiment, int):
         require(0 <= experiment < count, f"The fit has experiments 0 to {count - 1}, got {experiment}.")
     if sigma is not None:
         require_positive("predict's sigma", sigma)
         require(np.size(sigma) > 0, "predict's sigma must be a number or an array of numbers, got an empty one.")
-    z = jnp.asarray(result.z, problem.dtype)
+    level = checked_level(result.level if level is None else level)
     try:
-        (value,), (J,) = _linearised(problem, eqx.Partial(_of_one, of, experiment), z)
+        (value,), (J,) = _linearised(result, eqx.Partial(_of_one, of, experiment))
     except TypeError as error:
         if "custom_vjp" not in str(error):
             raise
@@ -73,12 +72,11 @@ def predict(
         ) from None
     noise = None
     if sigma is not None:
-        fault = f"predict's sigma must fit what is predicted, of shape {value.shape}, got shape {np.shape(sigma)}."
         try:
             noise = np.broadcast_to(np.asarray(sigma, float), value.shape)
         except ValueError:
+            fault = f"predict's sigma must fit what is predicted, of shape {value.shape}, got shape {np.shape(sigma)}."
             raise ValueError(fault) from None
-    level = checked_level(result.level if level is None else level)
     return banded(result.uncertainty, level, value, J, noise)
 
 
@@ -108,7 +106,7 @@ def predict_observations(
         shape == wanted,
         f"predict_observations needs experiments with as many observations as were fitted, {wanted}, got {shape}.",
     )
-    problem, observations = result.problem, [o for e in asked for o in e.observations]
+    observations = [o for e in asked for o in e.observations]
     level = checked_level(result.level if level is None else level)
     same = all(
         e.t1 == f.t1 and eqx.tree_equal(e.observations, f.observations) for e, f in zip(asked, fitted, strict=True)
@@ -117,8 +115,7 @@ def predict_observations(
         values, derivatives = result.fitted
     else:
         asked = tuple(e.with_observations(a.observations, a.t1) for e, a in zip(fitted, asked, strict=True))
-        z = jnp.asarray(result.z, problem.dtype)
-        values, derivatives = _linearised(problem, eqx.Partial(_observed, asked), z)
+        values, derivatives = _linearised(result, eqx.Partial(_observed, asked))
     predictions = []
     each = zip(values, derivatives, observations, result.sigmas, strict=True)
     for number, (value, J, o, sigma) in enumerate(each):
@@ -150,27 +147,26 @@ def _observed(experiments: tuple[Experiment, ...], problem: FitProblem, z: Coord
     return tuple(predicted)
 
 
-@eqx.filter_jit
 def _linearised(
-    problem: FitProblem, function: Callable[[FitProblem, Coordinates], tuple[Array, ...]], z: Coordinates
-) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Values and their derivatives by the coordinates, shape (..., n), compiled."""
-    values, columns = linearised(partial(function, problem), z, problem.at_once)
-    return values, tuple(jnp.moveaxis(column, 0, -1) for column in columns)
+    result: FitResult, function: Callable[[FitProblem, Coordinates], tuple[Array, ...]]
+) -> tuple[tuple[Array, ...], list[np.ndarray]]:
+    """Values that follow from a fit, and their derivatives by the coordinates, shape (..., n)."""
+    problem = result.problem
+    z = jnp.asarray(result.z, problem.dtype)
+    values, columns = _compiled(function, problem, z)
+    return values, [np.moveaxis(np.asarray(column), 0, -1) for column in columns]
+
+
+_compiled = eqx.filter_jit(lambda function, problem, z: linearised(partial(function, problem), z, problem.at_once))
 
 
 class Bootstrap(AbstractFit):
     """The estimates of fits of data drawn anew; `result["E"].interval` is a percentile interval."""
 
-    estimates: tuple[Estimate, ...]
-    """The fitted numbers: values of the fit of what was measured, errors and percentile intervals of the samples."""
+    estimates: tuple[Estimate, ...]  # of the fit of what was measured, errors and intervals of the samples
     samples: Float[np.ndarray, "k n"]  # their values in each fit that did not fail, shape (k, n)
     level: float  # the level of the intervals [-]
     failed: int  # how many fits failed, or came to no minimum
-
-    @property
-    def all(self) -> tuple[Estimate, ...]:
-        return self.estimates
 
     def __str__(self) -> str:
         """A table."""
@@ -193,9 +189,9 @@ def bootstrap(
     fit's σ, fitted again, many times (the parametric bootstrap: B. Efron, R. J. Tibshirani, An Introduction to the
     Bootstrap, Chapman & Hall 1993, chapters 6.5 and 13).
 
-    It takes the model and the independence of the noise for granted, as the errors of `fit` do: what it adds is the
-    curvature of the model and what bounds do. `weight` and `robust` act in each fit; the noise drawn is of σ for each
-    number. A prior's mean is drawn anew too. 200 repeats fix a standard error to 5 %, a 95 % interval less well.
+    It takes the model and the independence of the noise for granted, as the errors of `fit` do, and adds the curvature
+    of the model and what bounds do. `weight` and `robust` act in each fit; the noise drawn is of σ for each number. A
+    prior's mean is drawn anew too. 200 repeats fix a standard error to 5 %, a 95 % interval less well.
 
     Args:
         result: the fit.
@@ -230,13 +226,11 @@ def bootstrap(
     )
     ends = [m.z for m in members.values() if m.converged]
     require(len(ends) > 1, f"Of {repeats} fits of data drawn anew {len(ends)} came to a minimum: raise max_steps.")
-    if len(ends) < repeats:
-        warn(
-            f"{repeats - len(ends)} of {repeats} fits of data drawn anew came to no minimum: intervals leave them out."
-        )
+    failed = repeats - len(ends)
+    if failed:
+        warn(f"{failed} of {repeats} fits of data drawn anew came to no minimum: intervals leave them out.")
     samples = np.array([problem.numbers(end) for end in ends])
-    lower, upper = np.quantile(samples, [(1 - result.level) / 2, (1 + result.level) / 2], axis=0).tolist()
-    errors = samples.std(axis=0, ddof=1).tolist()
-    each = zip(result.estimates, errors, lower, upper, strict=True)
-    estimates = tuple(e._replace(error=error, interval=(a, b)) for e, error, a, b in each)
-    return Bootstrap(estimates, samples, result.level, repeats - len(ends))
+    ends = np.quantile(samples, [(1 - result.level) / 2, (1 + result.level) / 2], axis=0).T.tolist()
+    each = zip(result.estimates, samples.std(axis=0, ddof=1).tolist(), ends, strict=True)
+    estimates = tuple(e._replace(error=error, interval=tuple(interval)) for e, error, interval in each)
+    return Bootstrap(estimates, samples, result.level, failed)

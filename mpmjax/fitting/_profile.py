@@ -261,7 +261,8 @@ def profile(
         warn(text)
     path = sorted(visited, key=lambda point: point[0][at])
     along_path, values = np.stack([numbers(z) for z, _ in path]), [value(place) for place, *_ in ends]
-    symmetric = intervals(problem, jnp.asarray(result.z), errors, result.gradient / wider**2, level)
+    pull = result.jacobian.T @ result.residuals * np.array([e.at_bound for e in result.estimates])
+    symmetric = intervals(problem, jnp.asarray(result.z), errors, pull / wider**2, level)
     return Profile(
         label=label,
         unit=result.estimates[at].unit,

@@ -11,11 +11,9 @@ import numpy as np
 
 from mpmjax._types import Array
 from mpmjax.checks import require
-from mpmjax.fitting._estimate import AbstractFit, Estimate, NoiseEstimate
+from mpmjax.fitting._estimate import IMPROBABLE, AbstractFit, Estimate, NoiseEstimate, Shape, improbable, shape_of
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._misfit import IMPROBABLE, Shape, improbable, shape_of
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._picture import draw_observation
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas, table
 from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
 from mpmjax.fitting._starts import Screening
@@ -29,6 +27,8 @@ from mpmjax.fitting._uncertainty import (
     seen_together,
     uncertainty,
 )
+from mpmjax.simulation import Run, warn_of_inaccuracy
+from mpmjax.state import warn_of_rounding
 
 
 class FitResult(AbstractFit):
@@ -47,6 +47,7 @@ class FitResult(AbstractFit):
         degrees_of_freedom: measured numbers and priors, less parameters.
         noise: the noise of each observation.
         experiments: the experiments with the fitted values.
+        runs: their runs, without what was observed, where the search made them; else empty.
         level: the level of the intervals [-], such as 0.95.
         optimiser: the method of the search.
         converged: whether the search met its tolerance.
@@ -69,6 +70,7 @@ class FitResult(AbstractFit):
     degrees_of_freedom: int
     noise: tuple[NoiseEstimate, ...]
     experiments: tuple[Experiment, ...]
+    runs: tuple[Run, ...]
     level: float
     optimiser: AbstractOptimiser
     converged: bool
@@ -89,25 +91,18 @@ class FitResult(AbstractFit):
         return self.uncertainty.covariance
 
     @property
-    def gradient(self) -> np.ndarray:
-        """The derivative of ½ Σ r² by the coordinates that a bound holds, zero of all others, shape (n,)."""
-        held = np.array([e.at_bound for e in self.estimates])
-        return np.asarray(self.jacobian.T @ self.residuals) * held
-
-    @property
     def correlation(self) -> np.ndarray:
         """Correlation of the estimates, shape (n, n)."""
         return self.uncertainty.correlation
 
     @property
     def spectrum(self) -> np.ndarray:
-        """The eigenvalues of the Fisher information JᵀJ, growing, shape (n,): 1/√λ is how far, in coordinates, the data
-        leave the direction open."""
+        """Eigenvalues of the Fisher information JᵀJ, growing, shape (n,): 1/√λ is how far the direction is open."""
         return self.uncertainty.spectrum
 
     @property
     def directions(self) -> np.ndarray:
-        """The eigenvectors of the Fisher information, one a column, shape (n, n)."""
+        """Eigenvectors of the Fisher information, one a column, shape (n, n)."""
         return self.uncertainty.directions
 
     @property
@@ -157,22 +152,30 @@ class FitResult(AbstractFit):
         if not predictions:
             each = zip(*self.fitted, strict=True)
             predictions = [banded(self.uncertainty, self.level, value, J) for value, J in each]
+        count = len(observations)
         if axes is None:
             from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
 
-            count = len(observations)
             axes = plt.subplots(count, 1, figsize=(5.4, 3.4 * count), layout="constrained", squeeze=False)[1]
         axes = tuple(np.ravel(np.asarray(axes, dtype=object)))
-        counts = len(axes), len(predictions), len(observations)
-        fault = f"{counts[0]} axes and {counts[1]} predictions for {counts[2]}"
-        require(len(set(counts)) == 1, f"plot takes axes and a prediction for each observation, got {fault}.")
+        fault = f"{len(axes)} axes and {len(predictions)} predictions for {count}"
+        fits = len(axes) == len(predictions) == count
+        require(fits, f"plot takes axes and a prediction for each observation, got {fault}.")
         for axis, observation, predicted, last in zip(axes, observations, predictions, fitted, strict=True):
-            draw_observation(axis, observation, predicted, last)
+            observation.draw(axis, predicted, last)
         return axes
 
     def restarted(self, parameters: Mapping[str, AbstractParameter]) -> dict[str, AbstractParameter]:
         """The parameters, to be searched from the fitted values."""
         return restarted(parameters, self.values)
+
+    def warn_of_runs(self) -> None:
+        """Give the warnings of the fitted experiments' runs, which give none while they are searched for."""
+        for run, experiment in zip(self.runs, self.experiments, strict=False):
+            warn_of_rounding(experiment.scene.grid, run.final.x, experiment.particles.x)
+            warn_of_inaccuracy(run)
+        for experiment in self.experiments[len(self.runs) :]:
+            experiment.run()
 
     @property
     def scene(self) -> Any:
@@ -205,37 +208,34 @@ class FitResult(AbstractFit):
                 f"{values.max():.4g}, median {np.median(values):.4g}; errors {errors.min():.2g} to "
                 f"{errors.max():.2g}, median {np.median(errors):.2g}"
             )
-        wider = any(e.interval != e.noise_interval for e in self.all)
+        head = ["", f"{'value':>12} ± {'error':<9}", f"{100 * self.level:g} % interval", f"{'start':>10}", ""]
         cells = [
-            (
-                e.name,
-                *e.cells,
-                *([f"{e.noise_interval[0]:.5g} to {e.noise_interval[1]:.5g}"] if wider else []),
-                "" if np.isnan(e.start) else f"{e.start:>10.4g}",
-                "at its bound" if e.at_bound else "",
-            )
+            [e.name, *e.cells, "" if np.isnan(e.start) else f"{e.start:>10.4g}", "at its bound" if e.at_bound else ""]
             for e in (*rows, *self.reported)
         ]
-        head = "", f"{'value':>12} ± {'error':<9}", f"{100 * self.level:g} % interval"
-        head = (*head, *(["by noise alone"] if wider else []), f"{'start':>10}", "")
-        noises = [
-            (
-                n.name,
-                f"{n.points:>12}",
-                f"{n.sigma:.3g} {'estimated' if n.estimated else 'given'}",
-                f"{n.misfit:.3g}",
-                n.shape and f"{n.shape}: worth {n.worth:.2g} independent numbers",
-            )
-            for n in self.noise
-        ]
+        if any(e.interval != e.noise_interval for e in self.all):
+            head.insert(3, "by noise alone")
+            for e, cell in zip((*rows, *self.reported), cells, strict=True):
+                cell.insert(3, f"{e.noise_interval[0]:.5g} to {e.noise_interval[1]:.5g}")
         first, *body = table(head, *cells)
+        shapes = any(n.shape for n in self.noise)
+        noise = table(
+            ("", f"{'numbers':>12}", "noise σ", "misfit/σ", "residuals" if shapes else ""),
+            *(
+                (
+                    n.name,
+                    f"{n.points:>12}",
+                    f"{n.sigma:.3g} {'estimated' if n.estimated else 'given'}",
+                    f"{n.misfit:.3g}",
+                    n.shape and f"{n.shape}: worth {n.worth:.2g} independent numbers",
+                )
+                for n in self.noise
+            ),
+        )
         chi = f"χ² = {self.chi_squared:.4g} for {self.degrees_of_freedom} degrees of freedom"
         chi += "" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}"
         who = f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations"
         lost = [] if self.converged else ["NOT CONVERGED: errors hold only at a minimum."]
-        noise = table(
-            ("", f"{'numbers':>12}", "noise σ", "misfit/σ", "residuals"[: 9 * any(n[-1] for n in noises)]), *noises
-        )
         looked = [] if self.screening is None else ["", str(self.screening)]
         before = [*self.remarks, ""] if self.remarks else []
         return "\n".join([*before, first, *many, *body, "", *noise, "", chi, who, *lost, *self.warnings, *looked])
@@ -254,8 +254,7 @@ than it was in the search; and the degrees of freedom of the estimate, zero wher
 
 
 def settle_noise(problem: FitProblem, minimum: Search, sigmas: Sigmas) -> tuple[Noise, bool]:
-    """The noise by the residuals at a minimum that was searched with `sigmas`, and whether the change moves the
-    minimum, which must then be searched again."""
+    """The noise by the residuals at a minimum that was searched with `sigmas`, and whether the change moves it."""
     r, J = np.asarray(minimum.seen.residuals), np.asarray(minimum.seen.jacobian)
     J = J[:, ~at_bound(r, J, np.asarray(problem.room(minimum.z)))]  # what a bound holds fits nothing away
     settled, changing = [], False
@@ -284,8 +283,7 @@ def fit_result(
     report: Mapping[str, Callable[[Experiment], Any]],
     level: float,
 ) -> FitResult:
-    """The result at a minimum, whose residuals are in units of the noise of its search, with the noise that they
-    settled; `report` and `level` as of `fit`."""
+    """The result at a minimum, whose residuals are in units of its search's noise; `report` and `level` as of `fit`."""
     r, J = np.array(minimum.seen.residuals, float), np.array(minimum.seen.jacobian, float)
     eps, z, noises, of_noise, of_misfit = float(jnp.finfo(problem.dtype).eps), minimum.z, [], [], []
     each = zip(problem.observations, problem.rows, problem.noise_is_given, settled, strict=True)
@@ -323,7 +321,6 @@ def fit_result(
     for name, of in report.items():
 
         def value(z: Coordinates, of: Callable[[Experiment], Any] = of) -> Array:
-            """A function of the first experiment."""
             return jnp.asarray(of(problem.at(z)[0]))
 
         number, derivative, both = float(value(z)), np.asarray(jax.jacfwd(value)(z), float), []
@@ -351,6 +348,7 @@ def fit_result(
         degrees_of_freedom=degrees,
         noise=tuple(noises),
         experiments=problem.at(z),
+        runs=minimum.seen.runs,
         level=level,
         optimiser=optimiser,
         converged=minimum.converged,
@@ -376,11 +374,11 @@ def intervals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper ends of the fitted numbers' intervals, each of shape (n,).
 
-    They are where Δχ² = 2 g δ + δ²/s² reaches its threshold q², s being the standard error and g the gradient, zero but
-    of what a bound holds. δ is of the coordinate. Beside a bound, at three times the reach or nearer, data that follow
-    the value would be missed too often: there each end is the farther of two, of the coordinate and of a straight line
-    in the value. Where that line meets the bound, it alone makes the interval, which ends there: the coordinate never
-    comes to a bound, and goes beyond all measure to the other side.
+    They are where Δχ² = 2 g δ + δ²/s² reaches its threshold q², δ of the coordinate, s the standard error and g the
+    gradient, zero but of what a bound holds. Beside a bound, at three times the reach or nearer, data that follow the
+    value would be missed too often: there each end is the farther of two, of the coordinate and of a straight line in
+    the value. Where that line meets the bound, it alone makes the interval, which ends there: the coordinate never
+    comes to a bound.
     """
     error, freedom = errors.of(np.eye(problem.size))
     q = quantile(level, freedom)
@@ -409,8 +407,7 @@ _SHAPES = {
 _EXACT = 1e-6  # misfit, in sizes of the data, below which data are exact
 _ROUNDINGS = 100  # the same in roundings
 _LEAST_FREEDOM = 4.0
-"""Degrees of freedom of a misfit that few independent numbers show, at least: fewer would widen an interval beyond what
-the factor, which errs to the safe side, asks for."""
+"""Degrees of freedom of a misfit, at least: the factor errs to the safe side, and fewer would widen intervals more."""
 _BESIDE = 3  # reaches of an interval within which it is beside a bound
 _NOISE_RTOL = 1e-3  # the noise of several observations is settled when its estimate changes less, relatively
 _LEAST = 1e-12  # smallest noise, in sizes of the data: exact data have none

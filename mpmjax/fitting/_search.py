@@ -3,6 +3,7 @@
 import abc
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from mpmjax._types import Array, Float
 from mpmjax.checks import require, require_whole
 from mpmjax.fitting._evaluation import evaluated, parts_kept
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+from mpmjax.simulation import Run
 
 
 class Evaluation(NamedTuple):
@@ -24,6 +26,7 @@ class Evaluation(NamedTuple):
     residuals: Float[Array, "m"] | None = None  # r [-], of an optimiser that uses them
     jacobian: Float[Array, "m n"] | None = None  # their derivative
     room: Float[Array, "2 n"] | None = None  # how far values can change until their bounds, see `FitProblem.room`
+    runs: tuple[Run, ...] = ()  # runs of the experiments, where they were a program of their own
 
 
 class AbstractOptimiser(eqx.Module):
@@ -240,6 +243,7 @@ def _iterated(
     for (k, search), (z, inner, seen) in zip(running.items(), ends, strict=True):
         cost, slope, history = float(seen.cost), float(np.abs(seen.gradient).max()), search.history
         iteration = Iteration(len(history), cost, slope, not history or cost != history[-1].cost, np.asarray(z))
+        seen = seen if seen.runs else seen._replace(runs=search.seen.runs)
         after[k] = Search(z, optimiser.directed(z, inner, seen), seen, (*history, iteration))
     return after
 
@@ -308,7 +312,9 @@ def iterate(
     place = optimiser.place(problem, inner)
     if place is None or (kept := parts_kept(problem, 1 + problem.size)) is None:
         return iterate_alone(problem, optimiser, z, sigmas, inner)
-    return iterate_alone(evaluated(problem, place, z, sigmas, kept), optimiser, z, (), inner)
+    at = evaluated(problem, place, z, sigmas, kept)
+    z, inner, seen = iterate_alone(replace(at, runs=()), optimiser, z, (), inner)
+    return z, inner, seen._replace(runs=at.runs) if np.array_equal(z, place) else seen
 
 
 @eqx.filter_jit

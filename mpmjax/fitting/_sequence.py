@@ -188,10 +188,6 @@ class RefinedFit(AbstractFit):
     order: tuple[float, ...]  # the order in the spacing with which each was extrapolated; NaN of what does not converge
     remark: str = ""  # whether a misfit beyond the noise falls with the spacing, in words; empty where there is none
 
-    @property
-    def all(self) -> tuple[Estimate, ...]:
-        return self.estimates
-
     def __str__(self) -> str:
         """A table: the estimates on each grid and the extrapolated ones."""
         rows = []
@@ -314,9 +310,8 @@ def fit_refined(
         warn(remark)
     extrapolated = [_extrapolate(kind, of, numbers, float(order), missed, normal) for kind, of in each]
     estimates, left, orders = zip(*extrapolated, strict=True)
-    return RefinedFit(
-        tuple(fits), tuple(numbers), estimates, tuple(e.error for e in fits[-1].all), left, orders, remark
-    )
+    parts = {"from_noise": tuple(e.error for e in fits[-1].all), "from_discretisation": left, "order": orders}
+    return RefinedFit(fits=tuple(fits), refinements=tuple(numbers), estimates=estimates, **parts, remark=remark)
 
 
 def _squares(coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...]) -> tuple[float, float]:

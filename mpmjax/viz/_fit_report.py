@@ -13,8 +13,6 @@ from mpmjax.fitting import (
     Prediction,
     Profile,
     RefinedFit,
-    Shown,
-    measured_components,
     predict_observations,
 )
 from mpmjax.io import replacing, save_figure
@@ -80,14 +78,13 @@ def draw_fit(
 
 def _draw_residuals(axis: Any, observation: AbstractObservation, predicted: Prediction, last: float) -> None:
     """Residuals of the components that were measured, in units of the noise; those fitted end at `last`."""
-    shown: Shown = getattr(observation, "shown", Shown())
-    name, against = observation.against
+    shown, (name, against) = observation.picture, observation.against
     x = shown.along(against)
     if predicted.sigma is not None:
         axis.axhspan(-2, 2, color="0.93", linewidth=0)
         axis.axhline(0, color="0.7", linewidth=0.8)
         r = ((predicted.value - observation.data) / predicted.sigma).reshape(len(x), -1)
-        for number, (k, _) in enumerate(measured_components(observation)):
+        for number, (k, _) in enumerate(observation.components):
             axis.plot(x, r[:, k], ".", color=f"C{number}", markersize=4)
     if against.max() > last:
         axis.axvline(float(shown.along(np.array([last]))[0]), color="0.6", linewidth=0.8, linestyle="--")
