@@ -49,10 +49,9 @@ class Columns:
         head = [name.strip() for name in head]
         for name in names:
             close = difflib.get_close_matches(name, head, 1)
-            apart = next((mark for mark in (";", "\t") if len(head) == 1 and mark in head[0]), None)
             hint = f", did you mean {close[0]!r}?" if close else f" among its {len(head)}."
-            if apart is not None:
-                hint = f": its fields are parted by {apart!r}; part them by commas."
+            if apart := [mark for mark in (";", "\t") if len(head) == 1 and mark in head[0]]:
+                hint = f": its fields are parted by {apart[0]!r}; part them by commas."
             # of what else is in the file nothing is said: it may be another file than was meant
             require(name in head, f"{path} has no column {name!r}{hint}")
             require(head.count(name) == 1, f"{path}, line {self.header_line}: the column {name!r} is there twice.")
@@ -88,8 +87,8 @@ class Columns:
             raise ValueError(f"{self.path}, line {self.lines[wrong[0]]}: {text}")
 
     def scaled(self, name: str, unit: float, key: str = "unit") -> np.ndarray:
-        """The numbers of a column in SI units, multiplied by `unit`, which the user calls `key`. A unit with a prefix
-        in its head, "x [mm]" or "stress_MPa", must be that one."""
+        """A column times `unit`, which the user calls `key`: in SI units. A unit with a prefix in its head, "x [mm]" or
+        "stress_MPa", must be that one."""
         stated = stated_unit(name)
         require(
             stated is None or np.isclose(unit, stated, rtol=1e-9),
@@ -99,8 +98,7 @@ class Columns:
         return self._data[name] * unit
 
     def times(self, name: str, unit: float, t1: float, *, grow: bool = True) -> np.ndarray:
-        """The times [s] of a column, multiplied by `unit`, which must lie in a run until t1 [s] and, with `grow`, grow
-        from row to row."""
+        """The times [s] of a column, which must lie in a run until t1 [s] and, with `grow`, grow from row to row."""
         times = self.scaled(name, unit, "time_unit")
         read, advice = (f", with time_unit = {unit:g},", "") if unit != 1 else ("", ", or give time_unit")
         self.require(times >= 0, f"{name} {{{name}}} lies before the run, which begins at 0: leave the row out.")
@@ -120,8 +118,7 @@ def after(times: np.ndarray, t1: float) -> np.ndarray:
     return times > t1 * (1 + ROUNDED)
 
 
-ROUNDED = 1e-6
-"""Part of a time by which it may be rounded: its step's number times dt, each in single precision, and more."""
+ROUNDED = 1e-6  # part of a time by which it may be rounded: its step's number times dt, each in single precision
 
 
 def stated_unit(name: str) -> float | None:

@@ -22,13 +22,11 @@ class Shown(eqx.Module):
     """How pictures show an observation: its columns in their file's units, if it has one.
 
     Args:
-        x: the abscissa's name, with its unit. Default: that of the observation.
-        y: the ordinate's name, with its unit.
+        x, y: names of abscissa and ordinate, with their units. Default: those of the observation.
         columns: names of the data's components, for the legend.
         x_unit: what one of the abscissa's unit is [SI].
         unit: what one of the data's unit is [SI]; negative where the file counts the other way.
-        path: times [s] and the abscissa at these, in its unit, of data that were not measured against time, shape
-            (2, m).
+        path: times [s] and the abscissa then, in its unit, of data not measured against time, shape (2, m).
     """
 
     x: str = eqx.field(static=True, default="")
@@ -75,19 +73,11 @@ class AbstractObservation(eqx.Module):
 
     @abc.abstractmethod
     def predict(self, seen: Any, run: Run) -> Array:
-        """The measurement that a run predicts, in the shape of the data; NaN where the run does not reach.
-
-        Args:
-            seen: what `observe` returned at the start and after each step, with a leading axis.
-            run: the run, for what states do not say: `run.dt`, `run.forces()`.
-        """
+        """The measurement that a run predicts, in the shape of the data; NaN where the run does not reach. `seen` is
+        what `observe` returned at the start and after each step, with a leading axis."""
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
-        """Check that the data fit an experiment with this scene and these prepared particles, until t1 [s].
-
-        Raises:
-            ValueError: they do not.
-        """
+        """Raise a `ValueError` if the data do not fit this scene and these prepared particles, until t1 [s]."""
 
     def explain(self, seen: Any, run: Run) -> None:
         """Raise a `ValueError` that says why a prediction is not finite, where it is not."""
@@ -190,10 +180,8 @@ class AbstractObservation(eqx.Module):
         return float(np.ptp(data) or np.abs(data).max() or 1.0)
 
     def residuals(self, predicted: Array, sigma: Scalar | Array) -> Array:
-        """√weight (predicted − data)/σ [-], in C order, shape (m,); zero where nothing was measured.
-
-        With `robust` large ones are drawn nearer (see `drawn_nearer`).
-        """
+        """√weight (predicted − data)/σ [-], in C order, shape (m,), by `drawn_nearer` if robust; zero where nothing was
+        measured."""
         require(
             predicted.shape == self.data.shape,
             f"{self.title} has data of shape {self.data.shape}, what the simulation says has shape {predicted.shape}.",
@@ -283,8 +271,8 @@ class Experiment(eqx.Module):
         return Experiment(self.scene, self.particles, t1=t1, dt=self.dt, observations=observations, **same)
 
     def until(self, t1: float) -> "Experiment":
-        """The experiment, ended at the first step from a time [s] on, with what was measured until then; itself
-        where nothing was, or the time is not before its end. What has no times, such as a `Curve`, is left out."""
+        """The experiment, ended at the first step from a time [s] on, with the data until then; itself where there are
+        none, or the time is not before its end. Observations without times, such as a `Curve`, are left out."""
         parts = [o.part_until(t1) for o in self.observations]
         kept = tuple(part for part in parts if part is not None)
         steps = int(np.ceil(t1 / self.dt - _ON_A_STEP))
@@ -294,17 +282,9 @@ class Experiment(eqx.Module):
 
     def run(self, *, adjoint: Any = None, throw: bool = True, checkpoint_bytes: int = 2**28) -> Run:
         """The simulation of it, with what its observations observe after each step (see `simulate`)."""
-        return simulate(
-            self.scene,
-            self.particles,
-            t1=self.t1,
-            dt=self.dt,
-            method=self.method,
-            observe=eqx.Partial(observe_all, self.observations),
-            adjoint=adjoint,
-            checkpoint_bytes=checkpoint_bytes,
-            throw=throw,
-        )
+        how: dict[str, Any] = {"adjoint": adjoint, "checkpoint_bytes": checkpoint_bytes, "throw": throw}
+        observe = eqx.Partial(observe_all, self.observations)
+        return simulate(self.scene, self.particles, t1=self.t1, dt=self.dt, method=self.method, observe=observe, **how)
 
     def predictions(self, run: Run) -> tuple[Array, ...]:
         """Predictions of a run of it by each observation, in the shape of its data."""

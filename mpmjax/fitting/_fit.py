@@ -62,18 +62,17 @@ def fit(
         print(result)
 
     The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched, with
-    derivatives through every step and every implicit solve. A step at which a simulation fails is not taken. Where an
-    observation gives no σ, it is estimated: as √(Σ r²/(m − n)) of one observation, and of several so that each
-    explains its own misfit, in rounds.
+    derivatives through every step and every implicit solve. A step at which a simulation fails is not taken. A σ that
+    is not given is estimated: as √(Σ r²/(m − n)) of one observation, and of several so that each explains its own
+    misfit, in rounds.
 
-    The misfit is held against the noise, and residuals of each observation against independent ones, in their order:
+    The misfit is held against the noise, and residuals of each observation, in their order, against independent ones:
     where there is more than that, other starts are tried (`starts`), the table says what shape residuals have, and
-    errors and intervals hold it. Of the noise alone they are those of the Gauss-Newton Hessian, (JᵀJ)⁻¹, and stand
-    beside them. The covariance is (JᵀJ)⁻¹ Σ c_k J_kᵀJ_k (JᵀJ)⁻¹, c_k being the product of χ²/ν of observation k, where
-    its noise was given and that is improbable (R. T. Birge, Phys. Rev. 40 (1932) 207, doi 10.1103/PhysRev.40.207), and
-    of its numbers over the independent ones that they are worth, N/N' (see `NoiseEstimate.worth`); with Student's
-    quantile of ν N'/N, or four, degrees of freedom. None of it sees what a parameter can make up for: fit on two
-    spacings (`fit_refined`). What the data do not see, or not apart, is named after the first Jacobian.
+    errors and intervals hold it. The covariance is (JᵀJ)⁻¹ Σ c_k J_kᵀJ_k (JᵀJ)⁻¹, c_k being the product of χ²/ν of
+    observation k, where its noise was given and that is improbable (R. T. Birge, Phys. Rev. 40 (1932) 207,
+    doi 10.1103/PhysRev.40.207), and of its numbers over the independent ones that they are worth, N/N' (see
+    `NoiseEstimate.worth`); with Student's quantile of ν N'/N, or four, degrees of freedom. Those of the noise alone, by
+    (JᵀJ)⁻¹, stand beside them. None of it sees what a parameter can make up for: fit on two spacings (`fit_refined`).
 
     Ctrl-C ends a fit after the iteration in progress, and it returns the best that it has, not converged.
 
@@ -89,8 +88,8 @@ def fit(
             parameters or few measured numbers, else `LBFGS`.
         memory: for what reverse mode stores, and for the tangents of forward mode that are made at once [B].
         progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`.
-        log: an HDF5 file that is to hold each iteration (docs/fitting.md). Whatever ends the fit, the file is whole and
-            lacks at most the iteration in progress. It holds the first search, and the last one from another start.
+        log: an HDF5 file that is to hold each iteration (docs/fitting.md), and lacks at most the one in progress,
+            whatever ends the fit. It holds the first search, and the last one from another start.
         resume: continue the fit of the log, bit for bit. Only the optimiser's `max_steps` may differ.
 
     Raises:
@@ -170,9 +169,8 @@ def fit(
 
 
 def chosen_optimiser(problem: FitProblem) -> AbstractOptimiser:
-    """Levenberg-Marquardt while its Jacobian is cheap: by forward mode it costs as much as a simulation for each few
-    parameters, by reverse mode for each measured number. Else L-BFGS, whose gradient costs the same for any number of
-    parameters, and which takes more iterations (docs/fitting.md has the measurement)."""
+    """Levenberg-Marquardt while its Jacobian is cheap, with few parameters or measured numbers; else L-BFGS, with more
+    iterations of the same cost for any number of parameters (docs/fitting.md has the measurement)."""
     columns = min(problem.size, ROW_COST * problem.measured)
     return LevenbergMarquardt() if columns <= MOST_COLUMNS else LBFGS()
 
@@ -194,9 +192,9 @@ def _in_rounds(
     progress: Callable[[str], None] | None = None,
     **options: Any,
 ) -> list[tuple[Search, Noise | None, bool, Sigmas]]:
-    """Searches of each problem, again and again until the noise that it leaves is the noise that it was made with: the
-    last one, with all iterations; the noise, None where it failed; whether that still changes the minimum; and the
-    noise that it was made with. `state` and `options` as of `search_many`, after so many `rounds`."""
+    """Searches of each problem, again and again until the noise that it leaves is the noise it was made with: the last
+    search, with all iterations; its noise, None where it failed; whether that still changes the minimum; and the noise
+    it was made with. `state` and `options` as of `search_many`, after so many `rounds`."""
     histories: list[tuple[Iteration, ...]] = [()] * len(problems)
     outcomes: dict[int, tuple[Search, Noise | None, bool, Sigmas]] = {}
     while starts:
@@ -251,10 +249,7 @@ def _random_pull(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Coordin
 
 
 class EnsembleFit(eqx.Module):
-    """One fit for each data set.
-
-    `print(result)` shows a table; `result.values["E"]` are the estimates of a parameter; `result.fits[3]` is one fit.
-    """
+    """One fit for each data set; `print(result)` shows a table, `result.values["E"]` the estimates of a parameter."""
 
     fits: tuple[FitResult | None, ...]  # the fit of each data set; None where it failed
     failures: dict[int, str]  # why fits failed, by the number of the data set
@@ -338,9 +333,8 @@ def fit_ensemble(
     Each gets the estimates and errors of `fit`. One that fails ends alone.
 
     Args:
-        experiments: the data sets: an experiment each, or several experiments each that share the parameters. They may
-            differ in every number (data, noise, places, velocities, materials), and in no shape, choice or function:
-            give a marker that was not seen as NaN.
+        experiments: the data sets: an experiment each, or several each that share the parameters. They may differ in
+            every number, and in no shape, choice or function: give a marker that was not seen as NaN.
         batch: how many searches run together, see `Starts`.
         progress: called with a line, such as `print`, as searches end.
         parameters, report, level, optimiser: see `fit`.

@@ -26,7 +26,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array
 from mpmjax.checks import require
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas
@@ -35,10 +34,8 @@ from mpmjax.io import ReplacedFile, check_hdf5, reason, reporting
 
 _FORMAT = 2
 _ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), ("accepted", "?"), ("seconds", "f8")]
-
 _MOST = 8  # numbers of an array that are written out
 _FREE = ("optimiser.max_steps",)  # choices that may differ in a fit that is continued: it may go on for longer
-
 
 Past = tuple[int, tuple[Iteration, ...], Sigmas, Search]
 """Number of rounds before the last one, and their iterations; noise of the last one, and its search."""
@@ -53,8 +50,8 @@ def recorded(
     *,
     resume: bool,
 ) -> Iterator[tuple[Past | None, Callable[[Sigmas, Search], None]]]:
-    """The past of a fit that a log holds, if it is to `resume`, and a function that records the search after each
-    iteration, with the noise of its round: in the log at this path, by lines of progress, or both."""
+    """The past of a fit that a log holds, if it is to `resume`, and a function that records a search with the noise of
+    its round after each iteration: in the log at this path, by lines of progress, or both."""
     rows, places, values, noise, past = [], [], [], [], None
     with ExitStack() as stack:
         if path is not None:
@@ -99,13 +96,11 @@ def recorded(
                 except OSError as error:
                     raise OSError(f"{error} If it has no room, make room, then resume the fit.") from None
 
-            def contents() -> str:
-                count = f"{len(rows)} iteration{'s' * (len(rows) != 1)}"
-                return f"{path} holds {count}. Resume it to continue."
-
             if not resume:
                 write(None)
-            stack.enter_context(reporting(contents))
+            stack.enter_context(
+                reporting(lambda: f"{path} holds {len(rows)} iteration{'s' * (len(rows) != 1)}. Resume it to continue.")
+            )
         begun = time.perf_counter() - (rows[-1][-1] if rows else 0.0)
         say = None if progress is None else _lines(problem, optimiser, progress, len(rows))
 
@@ -125,8 +120,8 @@ def recorded(
 
 
 def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: dict[str, str]) -> tuple[Any, ...]:
-    """The iterations in a log as rows, coordinates and values, the noise of its rounds, and the past of the fit. It
-    must be whole and of the same fit."""
+    """Rows, coordinates and values of the iterations in a log, which must be whole and of the same fit, the noise of
+    its rounds, and the past of the fit."""
     import h5py
 
     damaged = f"{path} is damaged ({{}}): begin the fit anew with another log."
@@ -166,7 +161,15 @@ def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: d
             like = eqx.filter_eval_shape(begin, problem, optimiser, jnp.zeros(problem.size), noise[-1])
             shapes, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
             leaves, tree = jax.tree.flatten(shapes)
-            state = [_like(leaf, arrays[f"resume/state/{k}"]) for k, leaf in enumerate(leaves)]
+            state = []
+            for k, leaf in enumerate(leaves):
+                data = arrays[f"resume/state/{k}"]
+                if (data.shape, data.dtype) != (leaf.shape, leaf.dtype):
+                    raise TypeError(
+                        f"the optimiser remembers {leaf.shape} of {leaf.dtype}, not {data.shape} of {data.dtype}"
+                    )
+                # As weakly typed as it was, or the next iteration would compile anew.
+                state.append(jnp.asarray(data.item() if leaf.weak_type and data.ndim == 0 else data))
             inner = eqx.combine(jax.tree.unflatten(tree, state), rest)
             past = rounds - 1, earlier, noise[-1], Search(jnp.asarray(places[-1]), inner, seen, history)
         return rows, places, list(arrays["values"]), noise, past
@@ -174,39 +177,24 @@ def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: d
         raise ValueError(damaged.format(reason(error))) from None
 
 
-def _like(leaf: Any, data: np.ndarray) -> Array:
-    """An array of the file, as weakly typed as the one that it stands for."""
-    if (data.shape, data.dtype) != (leaf.shape, leaf.dtype):
-        raise TypeError(f"the optimiser remembers {leaf.shape} of {leaf.dtype}, not {data.shape} of {data.dtype}")
-    return jnp.asarray(data.item() if leaf.weak_type and data.ndim == 0 else data)
-
-
 def described(problem: FitProblem, optimiser: AbstractOptimiser) -> dict[str, str]:
-    """Every number, choice and function of a fit by its dotted path.
-
-    Arrays stand as a digest, functions as their name and a digest of their code, and the `where` of a parameter as the
-    numbers that change with it.
-    """
+    """Every number, choice and function of a fit by its dotted path: arrays as a digest, functions as their name and a
+    digest of their code, and the `where` of a parameter as the numbers that change with it."""
     texts = dict(_texts(optimiser, "optimiser"))
     for k, experiment in enumerate(problem.experiments):
         texts |= dict(_texts(experiment, f"experiments.{k}"))
     for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
-        texts[f"parameters.{name}"] = _changed(problem, parameter, start)
+        experiment = problem.experiments[0 if parameter.only is None else parameter.only[0]]
+        put = parameter.put(experiment, start + 1 + jnp.abs(start))
+        before, after = (jax.tree_util.tree_leaves_with_path(tree) for tree in (experiment, put))
+        changed = [
+            jax.tree_util.keystr(path).lstrip(".")
+            for (path, a), (_, b) in zip(before, after, strict=False)
+            if eqx.is_array_like(a) and not np.array_equal(a, b)
+        ]
+        texts[f"parameters.{name}"] = f"{type(parameter).__name__} of {', '.join(changed)}"
         texts |= dict(_texts(parameter, f"parameters.{name}"))
     return {name: text for name, text in texts.items() if name not in _FREE}
-
-
-def _changed(problem: FitProblem, parameter: AbstractParameter, start: Any) -> str:
-    """The numbers of an experiment that change with a parameter."""
-    experiment = problem.experiments[0 if parameter.only is None else parameter.only[0]]
-    put = parameter.put(experiment, start + 1 + jnp.abs(start))
-    before, after = (jax.tree_util.tree_leaves_with_path(tree) for tree in (experiment, put))
-    names = [
-        jax.tree_util.keystr(path).lstrip(".")
-        for (path, a), (_, b) in zip(before, after, strict=False)
-        if eqx.is_array_like(a) and not np.array_equal(a, b)
-    ]
-    return f"{type(parameter).__name__} of {', '.join(names)}"
 
 
 def _texts(value: Any, path: str) -> Iterator[tuple[str, str]]:
@@ -265,17 +253,14 @@ def _digest(data: bytes) -> str:
 def _lines(
     problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None], done: int
 ) -> Callable[[Search, float], None]:
-    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left. The first one says
-    that an iteration begins, which is compiled before; a log may hold iterations that are done.
+    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left of the present search.
+    The first one says that an iteration is compiled; `done` are in the log.
 
-    The time left is that of the present search. It is the usual time of an iteration times how many are left: about so
-    many as the optimiser's distance from converged needs to fall to one at the rate of the last three iterations, where
-    it is known and falls; else at most those up to `max_steps`. While only the iteration that was compiled is timed,
-    and at the end, nothing is said of it.
+    The time left is the median time of an iteration times how many are left: about so many as the optimiser's distance
+    from converged needs to fall to one, where it falls; else at most those up to `max_steps`. It is not said while only
+    the iteration that was compiled is timed, and at the end.
     """
-    durations: list[float] = []
-    distances: list[float] = []
-    last = time.perf_counter()
+    durations, distances, last = list[float](), list[float](), time.perf_counter()
     labels = ", ".join(problem.labels[:SHOWN]) + (", …" if problem.size > SHOWN else "")
     after = f" after {done} iterations of the log" if done else ""
     count = f"{problem.size} number{'s' * (problem.size > 1)}"

@@ -32,10 +32,8 @@ class Curve(_Measured):
         x: measured abscissae, shape (m,).
         data: measured ordinates y, shape (m,).
         of: function of (scene, particles) that returns one point (x, y) of the simulated curve; x must grow in time.
-        sigma: standard deviation of the noise of y; None to estimate it.
-        weight, robust, name: see `Series`.
-        x_name: what pictures call the abscissa.
-        shown: how pictures show it, such as in other units.
+        sigma, weight, robust, name, shown: see `Series`.
+        x_name: the abscissa's name in pictures.
     """
 
     x: Float[np.ndarray, "m"] = eqx.field(converter=as_floats)
@@ -88,9 +86,7 @@ class Curve(_Measured):
 
 
 class Series(_Measured):
-    """A quantity measured against time: a height, a front, an energy, an image, anything that a state says.
-
-    Between steps it is interpolated linearly.
+    """A quantity measured against time, anything that a state says; between steps it is interpolated linearly.
 
     Args:
         times: when it was measured [s], shape (f,), growing, from 0 to the experiment's t1.
@@ -130,8 +126,8 @@ class Series(_Measured):
         return self._at_times(seen, run)
 
     def _at_times(self, values: Array, run: Run, first: Scalar = 0.0) -> Array:
-        """Values at the times, from one for each step or state, shape (k, ...), of which the first stands `first` steps
-        from the start; NaN at times that a parameter has moved out of the run."""
+        """Values at the times, from those of all steps, shape (k, ...), the first of which is `first` steps from the
+        start; NaN at times that a parameter has moved out of the run."""
         step = jnp.asarray(self.times, values.dtype) / run.dt
         outside = (step < -_BEYOND) | (step > (len(run.steps) - 1) * (1 + ROUNDED) + _BEYOND)
         outside = outside.reshape(-1, *[1] * (values.ndim - 1))
@@ -177,8 +173,7 @@ class Tracks(Series):
         times: when they were seen [s], shape (f,), growing.
         positions: where [m], shape (f, m, d); NaN where a marker was not seen.
         which: the markers: numbers of particles, shape (m,), or `Markers.at` for places between particles.
-        sigma: standard deviation of the noise of a coordinate [m]; None to estimate it.
-        weight, robust, name: see `Series`.
+        sigma, weight, robust, name: see `Series`.
     """
 
     def __init__(
@@ -215,8 +210,7 @@ class Tracks(Series):
 
 
 class Force(Series):
-    """The force on a collider, or on any boundary, against time, such as that of a plate on which a body falls or of a
-    grip that pulls.
+    """The force on a collider, such as a plate on which a body falls, or on any boundary, against time.
 
     Compared with the force of each step at its own time (see `Forces`), interpolated linearly.
 
@@ -224,10 +218,8 @@ class Force(Series):
         times: when it was measured [s], shape (f,), growing.
         forces: the force [N], shape (f, d); NaN where a component was not measured.
         collider: number of the collider, from 0, in the order of the scene's boundaries.
-        boundary: number of the boundary, from 0, in the scene's order, in the place of `collider`. The scene must have
-            `boundary_forces`.
-        sigma: standard deviation of the noise [N]; None to estimate it.
-        weight, robust, name: see `Series`.
+        boundary: in its place, number of the boundary, in the scene's order. The scene must have `boundary_forces`.
+        sigma, weight, robust, name: see `Series`.
     """
 
     collider: int = eqx.field(static=True)
@@ -275,9 +267,8 @@ class Force(Series):
 
 
 class Torque(Force):
-    """The torque on a collider or boundary against time, as `Force`: [N m], shape (f, 1) in two dimensions and (f, 3)
-    in three, about the centre of the collider's rotation or, where it has none, about its shape's middle; of a grip
-    about its region's middle, of other boundaries about the origin."""
+    """The torque on a collider or boundary against time, as `Force`: [N m], shape (f, 1) in two dimensions, (f, 3) in
+    three, about the centre of the collider's rotation, else its shape's middle, a grip's middle, or the origin."""
 
     _component: ClassVar = "torque"
 
@@ -289,8 +280,7 @@ def _nothing(scene: Scene, particles: Particles) -> Array:
 
 
 def between(values: Array, place: Array) -> Array:
-    """Values between rows of `values`, shape (f, ...), at row numbers `place` that are not whole, shape (m,): by linear
-    interpolation, or extrapolation beyond the first and the last two."""
+    """Values at row numbers `place`, shape (m,), that are not whole, by linear interpolation or extrapolation."""
     last = jnp.clip(jnp.floor(place + _ON_A_ROW), 0, len(values) - 2)
     share, at = (place - last).reshape(-1, *[1] * (values.ndim - 1)), last.astype(int)
     return (1 - share) * values[at] + share * values[at + 1]

@@ -22,23 +22,21 @@ from mpmjax.fitting._search import AbstractOptimiser, Evaluation
 class LevenbergMarquardt(AbstractOptimiser):
     """The Levenberg-Marquardt method of optimistix on the residuals and their Jacobian.
 
-    One compiled function makes an iteration: it evaluates residuals and Jacobian together, once. A step at which a
-    simulation fails has residuals of NaN, is not taken, and the next is shorter.
+    A step at which a simulation fails has residuals of NaN, is not taken, and the next is shorter.
 
     Near a bound the coordinate hides the value from it: the damping then holds a step that the data ask for. There the
     next one is the Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds.
 
     It ends by optimistix's criterion, or where the next Gauss-Newton step, no longer than to a bound, would be less
     than a ten-thousandth of the standard error that the misfit gives, or where a step is refused and could lower the
-    sum of squares by no more than its rounding: in single precision residuals are never still. Where it can only make
-    steps far shorter than the Gauss-Newton step, since the simulation fails beyond or the misfit has a kink, it has not
-    converged.
+    sum of squares by no more than its rounding, as in single precision. Where only steps far shorter than the
+    Gauss-Newton step are taken, since the simulation fails beyond or the misfit has a kink, it has not converged.
 
     Args:
         rtol: relative and absolute tolerance of coordinates and residuals.
         max_steps: most iterations.
-        mode: how the Jacobian is made: "forward", by a tangent a coordinate beside the simulation; "reverse", by a pass
-            back a measured number. Default: what costs less.
+        mode: of the Jacobian: "forward", by a tangent a coordinate beside the simulation; "reverse", by a pass back a
+            measured number. Default: the cheaper one.
     """
 
     rtol: Scalar = 1e-6
@@ -55,11 +53,12 @@ class LevenbergMarquardt(AbstractOptimiser):
             rows = problem.measured + len(jax.eval_shape(problem.prior_residuals, z.astype(problem.dtype)))
         else:
             rows = len(jax.eval_shape(lambda z: problem.jacobian(z.astype(problem.dtype), sigmas, self.mode), z)[0])
-        return _begun(self._solver, z, rows)
+        r, J, room = (jnp.zeros(shape, z.dtype) for shape in ((rows,), (rows, len(z)), (2, len(z))))
+        at, shape = Evaluated(z, r, J, (room, room)), jax.eval_shape(lambda: r)
+        return self._solver.init(_residuals, z, (at, (), None), {}, shape, None, frozenset())
 
     def place(self, problem: FitProblem, state: Any) -> Coordinates | None:
-        mode = problem.cheaper_mode if self.mode is None else self.mode
-        return state.y_eval if mode == "forward" else None
+        return state.y_eval if (self.mode or problem.cheaper_mode) == "forward" else None
 
     def iterate(
         self, problem: FitProblem | Evaluated, z: Coordinates, sigmas: Sigmas, state: Any
@@ -130,17 +129,8 @@ class LevenbergMarquardt(AbstractOptimiser):
         return eqx.tree_at(lambda s: s.search, solver, _TrustRegion())
 
 
-@eqx.filter_jit
-def _begun(solver: Any, z: Coordinates, rows: int) -> Any:
-    """The state before the first iteration, of so many residuals."""
-    r, J, room = (jnp.zeros(shape, z.dtype) for shape in ((rows,), (rows, len(z)), (2, len(z))))
-    at, shape = Evaluated(z, r, J, (room, room)), jax.eval_shape(lambda: r)
-    return solver.init(_residuals, z, (at, (), None), {}, shape, None, frozenset())
-
-
 class _TrustRegion(optimistix.ClassicalTrustRegion):
-    """A trust region that takes no step uphill, though its quadratic foretells one: near a bound that is of
-    coordinates, and the step of values."""
+    """A trust region that takes no step uphill, though near a bound its quadratic, of coordinates, may foretell one."""
 
     def predict_reduction(self, y_diff: Any, f_info: Any) -> Any:
         return jnp.minimum(super().predict_reduction(y_diff, f_info), 0)
@@ -179,12 +169,11 @@ class LBFGS(AbstractOptimiser):
 
     An iteration is a line search: mostly one simulation with its gradient, whose cost does not grow with the number of
     parameters. The first step is of length one at most. A step at which a simulation or its derivative fails counts as
-    infinitely bad, and the search goes on between it and where it was. A line search that finds nothing lower is begun
-    again along the negative gradient; where that finds nothing either, the search ends, and has not converged.
+    infinitely bad. A line search that finds nothing lower is begun again along the negative gradient; where that finds
+    nothing either, the search ends, and has not converged.
 
-    It ends where two line searches in a row bring the cost, ½ Σ r², less than `rtol`² σ² lower, by what they foresaw
-    and by what they did, σ² = Σ r²/(m − n) being the mean square of the misfit: some `rtol` standard errors from the
-    minimum. Or where what they bring is lost in the rounding of the run's precision.
+    It ends where two line searches in a row bring the cost, ½ Σ r², less than `rtol`² σ² lower, foreseen and done,
+    σ² = Σ r²/(m − n): some `rtol` standard errors from the minimum. Or where rounding hides what they bring.
 
     Args:
         rtol: distance from the minimum at which it ends, in standard errors.
@@ -278,8 +267,7 @@ class LBFGSState(NamedTuple):
     cost: Float[Array, ""]
     gradient: Coordinates
     past: optax.ScaleByLBFGSState  # past steps and the changes of the gradient in them
-    predicted_decrease: Float[Array, ""]
-    """Decrease of the cost that the gradient predicted for the last line search that lowered nothing."""
+    predicted_decrease: Float[Array, ""]  # of the cost, by the gradient, for the last line search that lowered nothing
     decrease_tolerance: Float[Array, ""]  # decrease of the cost below which a line search is negligible
     small: Int[Array, ""]  # how many line searches in a row brought next to nothing
     stalled: Bool[Array, ""]  # whether nothing lower was found along the negative gradient
@@ -303,16 +291,13 @@ def evaluated_once(evaluate: Callable[[Coordinates], tuple[Array, Array]]) -> Ca
 class Adam(AbstractOptimiser):
     """The Adam method of optax on gradients by reverse mode: for costs that are rough, where a line search is caught.
 
-    An iteration is one simulation with its gradient. Each coordinate changes by about the learning rate: 0.05 is five
-    per cent of a `Positive` parameter. The search keeps the best place that it has seen. Where a simulation or its
-    derivative fails, or `patience` iterations in a row find nothing lower, it goes back there and begins anew, its
-    steps half as long.
-
-    It ends where its steps are shorter than `atol` coordinates.
+    An iteration is one simulation with its gradient. The search keeps the best place that it has seen. Where a
+    simulation or its derivative fails, or `patience` iterations in a row find nothing lower, it goes back there and
+    begins anew, its steps half as long. It ends where these are shorter than `atol` coordinates.
 
     Args:
-        learning_rate: length of a step in each coordinate [-], or a schedule of it, a function of the number of the
-            iteration such as those of optax.
+        learning_rate: length of a step in each coordinate [-], 0.05 for five per cent of a `Positive` parameter, or a
+            schedule of it, a function of the number of the iteration such as those of optax.
         atol: length of the steps at which it ends [-].
         max_steps: most iterations.
         patience: iterations in a row without a lower cost, after which steps are halved.
@@ -350,8 +335,8 @@ class Adam(AbstractOptimiser):
         back = ~usable | (fruitless >= self.patience)
         z, best, slope = _where(lower | first, (state.trial, cost, gradient), (z, state.cost, state.gradient))
 
-        fresh = _MOMENTS.init(z)
-        start, from_here, moments = _where(back, (z, slope, fresh), (state.trial, gradient, state.moments))
+        anew = z, slope, _MOMENTS.init(z)
+        start, from_here, moments = _where(back, anew, (state.trial, gradient, state.moments))
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
             direction, moments = _MOMENTS.update(from_here, moments)
         factor = jnp.where(back, state.factor / 2, state.factor)

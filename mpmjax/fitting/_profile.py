@@ -54,16 +54,11 @@ class Profile(eqx.Module):
 
     @property
     def signed_root(self) -> np.ndarray:
-        """±√Δχ², negative below the estimate, shape (p,): a straight line in the search's coordinate where the
-        symmetric interval is right."""
+        """±√Δχ², negative below the estimate, shape (p,): straight in the coordinate where `symmetric` is right."""
         return np.sign(self.values - self.estimate) * np.sqrt(np.maximum(self.statistic, 0))
 
     def along(self, label: str) -> np.ndarray:
-        """Another fitted number where this one is held, shape (p,).
-
-        Raises:
-            ValueError: there is none of this name.
-        """
+        """Another fitted number where this one is held, shape (p,); a ValueError if there is none of this name."""
         require(label in self.labels, f"The profile has {', '.join(self.labels)}, got {label!r}.")
         return self.numbers[:, self.labels.index(label)]
 
@@ -102,10 +97,9 @@ def profile(
     doi 10.2307/2347496). Unlike the interval of the standard error it does not depend on the coordinate, and need be
     neither symmetric nor finite. In a linear problem both are one.
 
-    From the estimate it goes to either side in steps of equal growth of √Δχ², as the last two points foretell it, each
-    fit started on the line through them. A value at which the simulation fails is approached by halves. Where the
-    threshold is never reached the interval is open, and where Δχ² jumps over it, as a simulation does beyond its stable
-    step, it ends there: a warning says so. One program is compiled for all points, and for all numbers of a fit.
+    From the estimate it goes to either side in steps of equal growth of √Δχ². Where the threshold is never reached the
+    interval is open, and where Δχ² jumps over it, as a simulation does beyond its stable step, it ends there: a warning
+    says so. One program is compiled for all points, and for all numbers of a fit.
 
     The noise is held at what the fit found. Where the fit's misfit is beyond it, the threshold is larger by the square
     of what errors are (see `fit`). With a robust or weighted observation it is approximate.
@@ -136,15 +130,13 @@ def profile(
     reach = float(quantile(level, freedom)) * wider
 
     def numbers(z: np.ndarray) -> np.ndarray:
-        """All fitted numbers at coordinates."""
         return np.asarray(problem.numbers(jnp.asarray(z, dtype)), float)
 
     def value(place: float) -> float:
-        """The value of the number where its coordinate is at a place, which may be infinite."""
+        """The number where its coordinate is at a place, which may be infinite."""
         return float(numbers(np.where(unit == 1, place, start[0]))[at])
 
     def misfit(z: np.ndarray) -> float:
-        """Σ r²."""
         return 2 * float(costs_at(problem, z[None], sigmas, 1)[0])
 
     start: _Point = np.asarray(result.z, float), 0.0
@@ -158,8 +150,8 @@ def profile(
         first_pace = float(np.log1p(first_pace))
 
     def visit(place: float, last: _Point, before: _Point) -> _Point | None:
-        """The least misfit with the coordinate held at a place; None where the simulation fails. The search of the
-        others starts on the line through two points, or along the direction of the covariance from the fit."""
+        """The least misfit with the coordinate held at a place, from the line through two points, or along the
+        covariance from the fit; None where the simulation fails."""
         nonlocal unsettled
         covered = last[0][at] - before[0][at]
         z = last[0] + (along / along[at] if covered == 0 else (last[0] - before[0]) / covered) * (place - last[0][at])
@@ -184,8 +176,8 @@ def profile(
         return visited[-1]
 
     def crossing(below: _Point, above: _Point) -> tuple[float, _Point, float | None, float | None]:
-        """Where √Δχ² is `reach` between two points, by Brent's method. A value at which the simulation fails counts as
-        beyond it. As of `end`, with Δχ² beyond a jump at the threshold, if it jumps."""
+        """Where √Δχ² is `reach` between two points, by Brent's method, and Δχ² beyond if it jumps there; see `end`. A
+        value at which the simulation fails counts as beyond."""
         from scipy.optimize import root_scalar  # here, since it takes long to import
 
         tried: dict[float, _Point | None] = {below[0][at]: below, above[0][at]: above}
@@ -211,7 +203,7 @@ def profile(
 
     def end(side: int) -> tuple[float, _Point, float | None, float | None]:
         """Walk to one side until √Δχ² is beyond `reach`: the coordinate where it crosses, infinite if it does not; the
-        last point; and the nearest coordinate at which the simulation fails, if it does."""
+        last point; the nearest coordinate at which the simulation fails, and Δχ² beyond a jump, if there are."""
         farthest = max(_FARTHEST, 3 * reach * error) if np.isfinite(error) else _FARTHEST
         before, last, pace, fault = start, start, first_pace, np.inf
         for _ in range(_MOST_POINTS):
@@ -289,8 +281,8 @@ def _root(point: _Point) -> float:
 
 
 class _RestrictedProblem(FitProblem):
-    """A problem on a plane of its coordinates, z = origin + basis y, as a function of y. Both are arrays: another plane
-    of as many dimensions does not compile anew."""
+    """A problem on a plane of its coordinates, z = origin + basis y, as a function of y: one program for all planes of
+    as many dimensions."""
 
     whole: FitProblem = eqx.field(kw_only=True)
     origin: Coordinates = eqx.field(kw_only=True)
@@ -320,15 +312,11 @@ class _RestrictedProblem(FitProblem):
         return self.whole.residuals(self.unrestricted(z), sigmas, adjoint)
 
 
-_FARTHEST = 14.0
-"""How far a profile is followed, in the search's coordinate: to a millionth and a million-fold of a positive one."""
+_FARTHEST = 14.0  # coordinates that a profile is followed: to a millionth and a million-fold of a positive number
 _MOST_POINTS = 40  # on one side
-_BEYOND = 1.02
-"""Steps are so much longer than is foretold, so that in a linear problem the last one goes beyond the threshold."""
+_BEYOND = 1.02  # steps are so much longer than foretold: in a linear problem the last one goes beyond the threshold
 _FASTER = 2.0  # a step is no longer than so many times the one before
-_STILL = 1e-6
-"""A walk ends where the number changes, over a unit of the coordinate, by less than so much of its estimate: at a
-bound."""
+_STILL = 1e-6  # part of its estimate by which a number at a bound changes over a unit of the coordinate: a walk ends
 _JUMP = 0.2  # √Δχ² that grows by more than this part of the threshold's within the tolerance jumps
 _NEAR_FAULT = 0.02  # a value at which the simulation fails is approached to this part of its distance from the estimate
 _BETTER = 1e-2  # a Δχ² below zero by more is another minimum

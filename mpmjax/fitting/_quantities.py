@@ -18,10 +18,7 @@ _NEIGHBOURS = 3  # particles that carry a marker, in each direction
 
 
 class Markers(eqx.Module):
-    """Where some material points are: means of the particles beside them.
-
-    Make them by `Markers.of` or `Markers.at`.
-    """
+    """Where some material points are: means of the particles beside them. Make them by `Markers.of` or `Markers.at`."""
 
     which: np.ndarray  # numbers of the particles that carry each marker, shape (m, k)
     share: np.ndarray  # their shares in its place, shape (m, k); they add up to one
@@ -29,11 +26,7 @@ class Markers(eqx.Module):
     @classmethod
     @checked
     def of(cls, which: Any) -> "Markers":
-        """Markers that are particles, by their numbers, shape (m,).
-
-        Raises:
-            ValueError: no whole numbers.
-        """
+        """Markers that are particles, by their numbers, shape (m,); a ValueError if these are not whole."""
         numbers = np.asarray(which)
         require(
             numbers.ndim == 1 and numbers.size > 0 and np.issubdtype(numbers.dtype, np.integer),
@@ -45,13 +38,10 @@ class Markers(eqx.Module):
     @classmethod
     @checked
     def at(cls, particles: Particles, places: Rows) -> "Markers":
-        """Markers painted on places of a body as it starts [m], shape (m, d).
+        """Markers painted on places of a body as it starts [m], shape (m, d); a ValueError if one does not lie on it.
 
-        A marker moves as the mean of its nearest particles, by shares of least squares that reproduce its place: it
-        then moves exactly with any motion that is affine beside it.
-
-        Raises:
-            ValueError: a place that does not lie among particles.
+        A marker moves as the mean of its nearest particles, by shares of least squares that reproduce its place: exact
+        of any motion that is affine beside it.
         """
         x, places = np.asarray(particles.x, float), np.asarray(places, float)
         d = particles.dim
@@ -100,17 +90,11 @@ class Markers(eqx.Module):
 
 
 class Extent(eqx.Module):
-    """How far the particles reach: a front, or a height [m].
-
-    Its derivative is that of the particle that reaches farthest.
-
-    Args:
-        axis: direction.
-        side: "upper" for the largest coordinate, "lower" for the smallest.
-    """
+    """How far the particles reach: a front, or a height [m]; its derivative is that of the farthest particle."""
 
     axis: int = eqx.field(static=True)
     side: Literal["upper", "lower"] = eqx.field(static=True, default="upper")
+    """"upper" for the largest coordinate, "lower" for the smallest."""
 
     def __check_init__(self):
         require_fields(self)
@@ -141,11 +125,7 @@ class StressStretch(eqx.Module):
     @classmethod
     @checked
     def of(cls, region: AbstractRegion, particles: Particles, axis: int) -> "StressStretch":
-        """Over the particles that start in a region, each weighted by its volume.
-
-        Raises:
-            ValueError: no particle starts in the region, or there is no such axis.
-        """
+        """Over the particles that start in a region, by their volumes; a ValueError if none does, or of no axis."""
         inside = np.asarray(region.contains(particles.x))
         require(inside.any(), f"The gauge {region} holds no particle at the start: enlarge or move it.")
         require(0 <= axis < particles.dim, f"The gauge's axis must be below {particles.dim}, got {axis}.")
@@ -166,20 +146,17 @@ class StressStretch(eqx.Module):
 class Density(eqx.Module):
     """A picture of the body: its density on the nodes of a lattice, smoothed by a quadratic B-spline.
 
-    For measured pictures, and for clouds of points whose correspondence is not known: a cloud becomes a picture by
-    `of_points`, and pictures are compared. The lattice's spacing is the distance over which points are told apart:
-    wide enough that shifted clouds still overlap, a tenth of the body or so, and wider than the points' spacing.
+    For measured pictures, and for clouds of points whose correspondence is not known, which become pictures. The
+    lattice's spacing is the distance over which points are told apart: wide enough that shifted clouds still overlap, a
+    tenth of the body or so, and wider than the points' spacing.
 
         picture = mpm.fitting.Density(mpm.Grid((40, 40), 0.05))
         seen = mpm.Series(times, [picture.of_points(cloud, mass) for cloud in clouds], picture)
 
     A series of it keeps a picture for each step, and for each parameter a derivative of that.
-
-    Args:
-        grid: the lattice; what lies outside is not in the picture.
     """
 
-    grid: Grid
+    grid: Grid  # the lattice; the picture ends with it
 
     def __check_init__(self):
         require_fields(self)
@@ -191,12 +168,7 @@ class Density(eqx.Module):
 
     @checked
     def of_points(self, points: Rows, mass: Scalar) -> np.ndarray:
-        """The picture of a cloud of points.
-
-        Args:
-            points: places [m], shape (m, d).
-            mass: of the body [kg], which they share evenly.
-        """
+        """The picture of points [m], shape (m, d), which share the body's mass [kg] evenly."""
         points = jnp.asarray(points, float)
         require(
             points.ndim == 2 and points.shape[1] == self.grid.dim and len(points) > 0,
