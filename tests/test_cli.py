@@ -274,6 +274,8 @@ def valid(value, schema, defs):
         inside = all(valid(v, known[k], defs) for k, v in value.items() if k in known)
         others = set() if schema.get("additionalProperties", True) is False else set(value) - set(known)
         return inside and set(schema["required"]) <= set(value) <= set(known) | others
+    if isinstance(value, dict) and isinstance(schema.get("additionalProperties"), dict):
+        return all(valid(v, schema["additionalProperties"], defs) for v in value.values())
     if isinstance(value, list) and "items" in schema:
         return all(valid(v, schema["items"], defs) for v in value)
     fits = value == schema.get("const", value) and value in schema.get("enum", [value])
@@ -297,8 +299,15 @@ def test_the_schema_holds_the_examples_and_no_slip():
         {"material": {"kind": "NeoHookean", "youngs_modulus": "soft", "poisson_ratio": 0.3}},
         {"boundary": [{"kind": "SlipBox", "lower": [0.0], "upper": [1.0], "friction": 0.1}]},
         {"run": {"dt": 0.1}},
+        {"material": {"gel": {"kind": "NeoHookean", "youngs_modulus": 1e5}}},
+        {"fit": {"levl": 0.9}},
+        {"fit": {"optimiser": "Newton"}},
+        {"fit": {"parameter": [{"path": "scene.material.youngs_modulus", "kind": "positive"}]}},
+        {"fit": {"observation": [{"kind": "Extent", "data": "a.csv", "time": "t", "axis": 0, "side": "upper"}]}},
     ):
         assert not valid(table | slip, schema, schema["$defs"]), slip
+    named = {"material": {"gel": table["material"]}, "fit": {"optimiser": {"kind": "LBFGS", "rtol": 1e-4}}}
+    assert valid(table | named, schema, schema["$defs"])
 
 
 def test_an_example_is_copied_with_its_data(tmp_path, monkeypatch):

@@ -28,6 +28,13 @@ def test_every_transformation_raises_what_is_at_fault_and_changes_nothing_else(t
         run(2.5)
 
 
+@pytest.mark.parametrize("jit", [jax.jit, eqx.filter_jit])
+def test_what_a_compiled_program_says_ends_with_the_fault(jit):
+    """After JAX's trace of the callback, and not with advice on another kind of jit."""
+    with pytest.raises(RuntimeError, match=r"x is large$"):
+        jit(guarded)(jnp.asarray(1.5)).block_until_ready()
+
+
 def test_what_is_not_used_is_not_checked():
     """A derivative that does not depend on the outcome is not stopped by it."""
     assert jax.jit(jax.grad(lambda x: 2 * x + 0 * jax.lax.stop_gradient(guarded(0.5))))(1.5) == 2

@@ -76,7 +76,14 @@ def _compiled(*operands: Any, faults: tuple[str, ...], failure: str, derivative:
     index = jnp.max(fault)
     if derivative:
         index = jnp.where((index == 0) & (signal != 0).any(), len(faults) + 1, index)
-    raised = eqx.branched_error_if(jnp.asarray(False), index > 0, index - 1, (*faults, failure))
+
+    def fail(index: Any) -> Any:
+        raise RuntimeError((*faults, failure)[int(index) - 1])
+
+    def called() -> Any:  # what JAX says of it ends with this line; `equinox.error_if` adds a page after its own
+        return jax.pure_callback(fail, jax.ShapeDtypeStruct((), bool), index)
+
+    raised = jax.lax.cond(index > 0, called, lambda: jnp.asarray(False))
 
     def unusable(dtype: Any) -> Any:
         if jnp.issubdtype(dtype, jnp.inexact):

@@ -9,4 +9,5 @@ from mpmjax.cli._commands import (
     run_scene as run_scene,
     study_scene as study_scene,
 )
-from mpmjax.cli._scene_file import load_scene as load_scene, scene_schema as scene_schema
+from mpmjax.cli._scene_file import load_scene as load_scene
+from mpmjax.cli._scene_schema import scene_schema as scene_schema

@@ -31,7 +31,7 @@ from mpmjax.fitting import (
 )
 from mpmjax.io import arguments, decode
 
-_OPTIMISERS: dict[str, type[AbstractOptimiser]] = {cls.__name__: cls for cls in (LevenbergMarquardt, LBFGS, Adam)}
+OPTIMISERS: dict[str, type[AbstractOptimiser]] = {cls.__name__: cls for cls in (LevenbergMarquardt, LBFGS, Adam)}
 
 
 class FitFile(NamedTuple):
@@ -76,10 +76,14 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
             _require_keys(sources[-1][2], f"[fit] of {file}", _KEYS)
         require(len(sources) > 0, "[fit] needs an [[fit.observation]], or an [[fit.experiment]] whose scene has one.")
         parts = [_experiments(*source) for source in sources]
-        settings = _settings(table)
+        chosen = {key: value for key, value in table.items() if key in _SETTINGS}
+        settings = fit_settings(**arguments(fit_settings, chosen, "[fit]"))
+        settings["optimiser"] = _optimiser(table["optimiser"]) if "optimiser" in table else None
         tables = _tables(table, "parameter")
         require(len(tables) > 0, "[fit] needs a [[fit.parameter]].")
-        named = [_parameter(t, [fitted for fitted, _ in parts]) for t in tables]
+        first = [fitted for fitted, _ in parts]
+        keys = [arguments(fit_parameter, t, "[[fit.parameter]]", without=("experiments",)) for t in tables]
+        named = [fit_parameter(first, **each) for each in keys]
         names = [name for name, _ in named]
         require(len(set(names)) == len(names), f"[[fit.parameter]] {', '.join(names)}: each needs a name of its own.")
         report = table.get("report", {})
@@ -113,30 +117,25 @@ def _require_keys(table: dict[str, Any], where: str, keys: set[str]) -> None:
         require(key in keys, f"{where} has the unknown key {key[:60]!r}{hint} Known are {', '.join(sorted(keys))}.")
 
 
-def _settings(table: dict[str, Any]) -> dict[str, Any]:
-    """Level, optimiser, starts and their fraction, horizons and refinements of a [fit] table."""
-
-    def settings(
-        *,
-        level: Scalar = 0.95,
-        starts: int | Literal["auto"] = "auto",
-        fraction: Scalar = 0.375,
-        horizons: tuple[float, ...] | bool = False,
-        refine: int | tuple[int, ...] = (),
-    ) -> dict[str, Any]:
-        require(0 < level < 1, f"[fit] level must lie between 0 and 1, got {level!r}.")
-        many = starts != "auto" and starts > 1
-        require(starts == "auto" or starts > 0, f"[fit] starts must be one at least, got {starts}.")
-        require(0 <= fraction <= 1, f"[fit] fraction must be from 0 to 1, got {fraction!r}.")
-        require(many or "fraction" not in table, "[fit] fraction is one of starts: give these too.")
-        require(not (many and horizons), "[fit] takes either starts or horizons.")
-        finer = refinements(refine if isinstance(refine, tuple) else (refine,), "[fit] refine")
-        places = starts if starts == "auto" else Starts(starts, float(fraction))
-        return {"level": float(level), "starts": places, "horizons": horizons, "refine": finer}
-
-    chosen = {key: value for key, value in table.items() if key in _SETTINGS}
-    optimiser = _optimiser(table["optimiser"]) if "optimiser" in table else None
-    return settings(**arguments(settings, chosen, "[fit]")) | {"optimiser": optimiser}
+def fit_settings(
+    *,
+    level: Scalar = 0.95,
+    starts: int | Literal["auto"] = "auto",
+    fraction: Scalar | None = None,
+    horizons: tuple[float, ...] | bool = False,
+    refine: int | tuple[int, ...] = (),
+) -> dict[str, Any]:
+    """Level, starts, horizons and refinements of a [fit] table."""
+    require(0 < level < 1, f"[fit] level must lie between 0 and 1, got {level!r}.")
+    many = starts != "auto" and starts > 1
+    require(starts == "auto" or starts > 0, f"[fit] starts must be one at least, got {starts}.")
+    require(many or fraction is None, "[fit] fraction is one of starts: give these too.")
+    fraction = 0.375 if fraction is None else fraction
+    require(0 <= fraction <= 1, f"[fit] fraction must be from 0 to 1, got {fraction!r}.")
+    require(not (many and horizons), "[fit] takes either starts or horizons.")
+    finer = refinements(refine if isinstance(refine, tuple) else (refine,), "[fit] refine")
+    places = starts if starts == "auto" else Starts(starts, float(fraction))
+    return {"level": float(level), "starts": places, "horizons": horizons, "refine": finer}
 
 
 def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:
@@ -150,9 +149,9 @@ def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:
 def _optimiser(data: Any) -> AbstractOptimiser:
     table, where = {"kind": data} if isinstance(data, str) else data, "[fit.optimiser]"
     kind = table.get("kind") if isinstance(table, dict) else None
-    there, kinds = isinstance(kind, str) and kind in _OPTIMISERS, ", ".join(_OPTIMISERS)
+    there, kinds = isinstance(kind, str) and kind in OPTIMISERS, ", ".join(OPTIMISERS)
     require(there, f"[fit] optimiser must have a kind, one of {kinds}, got {shortened(repr(data))}.")
-    cls = _OPTIMISERS[str(kind)]
+    cls = OPTIMISERS[str(kind)]
     try:
         return cls(**arguments(cls, {key: value for key, value in table.items() if key != "kind"}, where))
     except ValueError as error:
@@ -203,52 +202,51 @@ def _tables(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
     return tables
 
 
-def _parameter(table: dict[str, Any], experiments: list[Experiment]) -> tuple[str, AbstractParameter]:
-    def parameter(
-        *,
-        path: str | None = None,
-        name: str | None = None,
-        kind: Literal["Positive", "Bounded", "Unbounded", "Velocity", "Spin"] = "Positive",
-        lower: Scalar | None = None,
-        upper: Scalar | None = None,
-        start: Scalar | tuple[float, ...] | None = None,
-        mean: Scalar | tuple[float, ...] | None = None,
-        sigma: Scalar | tuple[float, ...] | None = None,
-        unit: str = "",
-        only: tuple[int, ...] | None = None,
-    ) -> tuple[str, AbstractParameter]:
-        where = f"[[fit.parameter]] {path or kind!r}"
-        require(
-            kind in ("Positive", "Bounded", "Unbounded", *_OF_THE_BODY),
-            f"{where}: there is no kind of parameter {kind!r}.",
-        )
-        numbers = (0,) if only is None else only
-        there = len(numbers) > 0 and all(0 <= k < len(experiments) for k in numbers)
-        require(there, f"{where}: only must name experiments from 0 to {len(experiments) - 1}, got {only}.")
-        require((mean is None) == (sigma is None), f"{where} takes mean and sigma of a prior together.")
-        prior = None if mean is None or sigma is None else Gaussian(mean, sigma)
-        common: dict[str, Any] = {"start": None if start is None else jnp.asarray(start, float), "prior": prior}
-        common |= {"unit": unit, "only": only}
-        bounds = lower is not None or upper is not None
-        require((kind == "Bounded") == bounds, f'{where}: lower and upper go with kind = "Bounded".')
-        if kind in _OF_THE_BODY:
-            require(path is None, f"{where}: {kind} is of all particles and takes no path.")
-            return name or kind.lower(), _of_the_body(kind, where, experiments[min(numbers)], common)
-        require(path is not None, f'{where} needs a path, such as "scene.material.youngs_modulus".')
-        owner, _, last = _path(path, where).rpartition(".")
-        value, parent = (leaf_of(of, experiments[min(numbers)]) for of in (str(path), owner))
-        names = [f.name for f in fields(parent)] if is_dataclass(parent) else [last]
-        fault = f"{where} follows from others and cannot be fitted; name one of {', '.join(names)}."
-        require(last in names, fault)
-        number = eqx.is_array_like(value) and np.issubdtype(np.asarray(value).dtype, np.floating)
-        require(number, f"{where} must be a number, but is {shortened(repr(value))}.")
-        common |= {"where": partial(leaf_of, str(path))}
-        if kind == "Bounded":
-            require(lower is not None and upper is not None, f"{where} needs lower and upper.")
-            return name or last, Bounded(lower=float(lower or 0.0), upper=float(upper or 0.0), **common)
-        return name or last, (Positive if kind == "Positive" else Unbounded)(**common)
-
-    return parameter(**arguments(parameter, table, "[[fit.parameter]]"))
+def fit_parameter(
+    experiments: list[Experiment],
+    *,
+    path: str | None = None,
+    name: str | None = None,
+    kind: Literal["Positive", "Bounded", "Unbounded", "Velocity", "Spin"] = "Positive",
+    lower: Scalar | None = None,
+    upper: Scalar | None = None,
+    start: Scalar | tuple[float, ...] | None = None,
+    mean: Scalar | tuple[float, ...] | None = None,
+    sigma: Scalar | tuple[float, ...] | None = None,
+    unit: str = "",
+    only: tuple[int, ...] | None = None,
+) -> tuple[str, AbstractParameter]:
+    """Name and parameter of a [[fit.parameter]] table, of these experiments."""
+    where = f"[[fit.parameter]] {path or kind!r}"
+    require(
+        kind in ("Positive", "Bounded", "Unbounded", *_OF_THE_BODY),
+        f"{where}: there is no kind of parameter {kind!r}.",
+    )
+    numbers = (0,) if only is None else only
+    there = len(numbers) > 0 and all(0 <= k < len(experiments) for k in numbers)
+    require(there, f"{where}: only must name experiments from 0 to {len(experiments) - 1}, got {only}.")
+    require((mean is None) == (sigma is None), f"{where} takes mean and sigma of a prior together.")
+    prior = None if mean is None or sigma is None else Gaussian(mean, sigma)
+    common: dict[str, Any] = {"start": None if start is None else jnp.asarray(start, float), "prior": prior}
+    common |= {"unit": unit, "only": only}
+    bounds = lower is not None or upper is not None
+    require((kind == "Bounded") == bounds, f'{where}: lower and upper go with kind = "Bounded".')
+    if kind in _OF_THE_BODY:
+        require(path is None, f"{where}: {kind} is of all particles and takes no path.")
+        return name or kind.lower(), _of_the_body(kind, where, experiments[min(numbers)], common)
+    require(path is not None, f'{where} needs a path, such as "scene.material.youngs_modulus".')
+    owner, _, last = _path(path, where).rpartition(".")
+    value, parent = (leaf_of(of, experiments[min(numbers)]) for of in (str(path), owner))
+    names = [f.name for f in fields(parent)] if is_dataclass(parent) else [last]
+    fault = f"{where} follows from others and cannot be fitted; name one of {', '.join(names)}."
+    require(last in names, fault)
+    number = eqx.is_array_like(value) and np.issubdtype(np.asarray(value).dtype, np.floating)
+    require(number, f"{where} must be a number, but is {shortened(repr(value))}.")
+    common |= {"where": partial(leaf_of, str(path))}
+    if kind == "Bounded":
+        require(lower is not None and upper is not None, f"{where} needs lower and upper.")
+        return name or last, Bounded(lower=float(lower or 0.0), upper=float(upper or 0.0), **common)
+    return name or last, (Positive if kind == "Positive" else Unbounded)(**common)
 
 
 _OF_THE_BODY = ("Velocity", "Spin")  # parameters of the initial motion of all particles

@@ -119,7 +119,7 @@ class Measurement:
             )
 
 
-_kinds: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {}
+KINDS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {}
 """Functions of a measurement and keys of their own that make the observations of a kind, and shared keys not taken."""
 _HEADER = "[[fit.observation]]"
 
@@ -129,25 +129,31 @@ def observation(
 ) -> tuple[AbstractObservation, AbstractObservation]:
     """An observation of a simulation as it is fitted, until t1 [s], and with all that was measured in a folder."""
     kind = table.get("kind")
-    there = isinstance(kind, str) and kind in _kinds
-    require(there, f"{_HEADER} kind must be one of {', '.join(_kinds)}, got {kind!r}.")
-    make, without = _kinds[str(kind)]
-    (_, *special), common = (inspect.signature(of).parameters.values() for of in (make, Measurement))
-    shared = [p for p in common if p.name not in ("simulation", "folder", *without)]
-
-    def keys(**_: Any) -> None: ...
-
-    keys.__signature__ = inspect.Signature([*special, *shared])  # pyright: ignore[reportFunctionMemberAccess]
+    there = isinstance(kind, str) and kind in KINDS
+    require(there, f"{_HEADER} kind must be one of {', '.join(KINDS)}, got {kind!r}.")
+    keys, shared = keys_of(str(kind))
     values = arguments(keys, {k: v for k, v in table.items() if k != "kind"}, f"{_HEADER} {kind}")
-    chosen: dict[str, Any] = {"time": ""} | {p.name: values.pop(p.name) for p in shared if p.name in values}
+    chosen: dict[str, Any] = {"time": ""} | {name: values.pop(name) for name in shared if name in values}
     measurement = Measurement(simulation=simulation, folder=folder, **chosen)
-    made = make(measurement, **values)
+    made = KINDS[str(kind)][0](measurement, **values)
     if isinstance(made, tuple):
         return _shown(made[0], measurement, values), _shown(made[1], measurement, values)
     made = _shown(made, measurement, values)
     part = made.part_until(t1)
     require(part is not None, f"{made.title} begins at {made.times[0]:g} s, after t1 = {t1:g} s.")
     return part, made
+
+
+def keys_of(kind: str) -> tuple[Callable[..., None], list[str]]:
+    """A function of all keys that the table of a kind takes, and those of them that kinds share."""
+    make, without = KINDS[kind]
+    (_, *special), common = (inspect.signature(of).parameters.values() for of in (make, Measurement))
+    shared = [p for p in common if p.name not in ("simulation", "folder", *without)]
+
+    def keys(**_: Any) -> None: ...
+
+    keys.__signature__ = inspect.Signature([*special, *shared])  # pyright: ignore[reportFunctionMemberAccess]
+    return keys, [p.name for p in shared]
 
 
 _SI = {"place": "m", "force": "N", "torque": "N m", "nominal_stress": "Pa"}
@@ -183,7 +189,7 @@ def _kind(name: str, without: tuple[str, ...] = ("length_unit",)) -> Callable[[C
     """Decorate a function (measurement, keys of its own) to make the observations of a kind."""
 
     def registered(make: Callable[..., Any]) -> Callable[..., Any]:
-        _kinds[name] = make, without
+        KINDS[name] = make, without
         return make
 
     return registered

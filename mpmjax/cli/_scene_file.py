@@ -16,7 +16,7 @@ from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
 from mpmjax.checks import checked, require, require_positive, shortened, warn
 from mpmjax.geometry import AbstractRegion
-from mpmjax.io import arguments, check_fields, class_schemas, decode, save, table_schema
+from mpmjax.io import arguments, check_fields, decode, save
 from mpmjax.simulation import number_of_steps
 from mpmjax.state import Particles, Scene, attach, fill, join, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
@@ -192,23 +192,6 @@ def stable_step(path: Path, file: SceneFile) -> float:
         return float(stable_dt(file.scene, file.particles, method=file.run.method, t1=file.run.t1))
     except ValueError as error:
         raise ValueError(f'{path}: [run] dt = "stable": {error}') from None
-
-
-def scene_schema() -> dict[str, Any]:
-    """The JSON schema of scene files, by which editors complete and check them; of [fit] it says that it is a table."""
-    particles = table_schema(fill, without=("grid", "dtype"))
-    particles["properties"]["material"] = {"type": ["integer", "string"]}
-    run = table_schema(RunSettings)
-    run["properties"]["method"]["anyOf"].append({"const": "auto"})
-    schema = table_schema(Scene)
-    schema["properties"] |= {
-        "particles": {"anyOf": [particles, {"type": "array", "items": particles}]},
-        "run": run,
-        "output": table_schema(save, without=("path", "run")),
-        "fit": {"type": "object"},
-    }
-    schema["required"] += ["particles", "run"]
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "$defs": class_schemas()} | schema
 
 
 def _find_meshes(table: Any, folder: Path) -> None:

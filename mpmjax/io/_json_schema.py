@@ -1,9 +1,9 @@
-"""The JSON schema of scene files, by which editors complete and check them."""
+"""The JSON schema of a function's arguments, and of classes that files hold."""
 
 import enum
 import inspect
 from collections.abc import Callable, Iterable
-from typing import Any, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import equinox as eqx
 
@@ -32,8 +32,11 @@ def class_schemas() -> dict[str, Any]:
 def _value_schema(hint: Any) -> dict[str, Any]:
     """The JSON schema of what an annotation takes."""
     json, options = {float: "number", int: "integer", bool: "boolean", str: "string"}, alternatives(hint)
-    choices: list[dict[str, Any]] = []
+    words = [word for a in options if get_origin(a) is Literal for word in get_args(a)]
+    choices: list[dict[str, Any]] = [{"enum": words}] if words else []
     for kind, depth in sorted(forms_of(hint), key=str):
+        if words and (kind, depth) == (str, 0):
+            continue
         value: dict[str, Any] = {"type": json[kind]}
         for _ in range(depth):
             value = {"type": "array", "items": value}
@@ -44,6 +47,8 @@ def _value_schema(hint: Any) -> dict[str, Any]:
             choices.append({"const": cls.__name__})  # its kind alone
         choices += [{"$ref": f"#/$defs/{name}"} for name, (_, result) in MADE.items() if result is cls]
     for a in options:
+        if get_origin(a) is dict:  # of objects by their names
+            choices.append({"type": "object", "additionalProperties": _value_schema(get_args(a)[1])})
         if is_class(a, enum.Enum):
             choices.append({"enum": [member.value for member in a]})
         elif get_origin(a) in (tuple, list) and (item := _value_schema(get_args(a)[0])) and not forms_of(a):

@@ -97,8 +97,8 @@ def simulate(
             nearer is a Python warning.
         RuntimeError: the same, and values that scene, particles or method do not allow, under an outer transformation
             (`jax.jit`, `jax.grad`, `jax.vmap` and what is made of them, where only the derivative is asked for too);
-            and a tangent or adjoint solve that did not converge. In compiled programs it is that of
-            `equinox.error_if`. With `throw=False` such values make the state NaN and such a solve the derivative.
+            and a tangent or adjoint solve that did not converge. Of compiled programs its text ends with the line that
+            says what is wrong. With `throw=False` such values make the state NaN and such a solve the derivative.
     """
     start = require_whole("start", start, 0)
     dtype = particles.x.dtype
