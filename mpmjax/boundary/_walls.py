@@ -130,6 +130,8 @@ class AbstractHoldingBox(AbstractBox):
 class StickyBox(AbstractHoldingBox):
     """Walls that hold what touches them: the whole velocity is zero at and beyond them, exactly, also after a solve.
 
+    A fluid is held by columns of nodes, as in a `SlipBox`.
+
     Args:
         lower: position of the lower wall in each direction [m], (d,); −inf for none.
         upper: position of the upper wall in each direction [m], (d,); inf for none.
@@ -148,6 +150,11 @@ class SlipBox(AbstractHoldingBox):
 
     Accurate to first order in the spacing. A wall at a multiple of half a spacing is better written as a
     `SymmetryPlane`, which is the same wall to second order: frictionless, and never left.
+
+    A fluid is held by columns of nodes whose normal velocity is linear across the wall and zero on it, wherever that
+    lies, so that it stays at rest.
+
+    *When it breaks*: a box that moves holds fluids at nodes too, and they press on it by a tenth too much.
 
     Args:
         lower: position of the lower wall in each direction [m], (d,); −inf for none.
