@@ -319,6 +319,8 @@ def vessel(kind, lower, upper):
             return (*low, *(mpm.SeparatingCollider(mpm.HalfSpace((*upper[:-1], 0.0), tuple(-a))) for a in n[:-1]))
         case "slip":
             return (mpm.SlipBox(lower, upper),)
+        case "sticky":
+            return (mpm.StickyBox(lower, upper),)
     plane = mpm.ContactPlane if kind == "contact" else mpm.SymmetryPlane
     sides = (plane(a, upper[a], keep="below") for a in range(d - 1))
     return (*(plane(a, lower[a]) for a in range(d)), *sides)
@@ -388,6 +390,11 @@ def test_a_wall_that_holds_a_fluid_keeps_a_velocity_that_is_linear_across_it(met
     [
         ("fluid", "box", 2, 0.0, 9.0),
         ("fluid", "box", 2, 0.1, 0.7),
+        ("fluid", "slip", 2, 0.1, 9.0),
+        ("fluid", "sticky", 2, 0.0, 0.7),
+        *thorough(*(("fluid", kind, 2, at, 0.7) for kind in ("slip", "sticky") for at in (0.0, 0.1, 0.25, 0.5))),
+        *thorough(*((law, "slip", 2, 0.1, 9.0) for law in ("viscous_fluid", "herschel_bulkley"))),
+        *thorough(("fluid", "slip", 3, 0.1, 9.0), ("viscous_fluid", "sticky", 2, 0.25, 9.0)),
         *thorough(*(("fluid", "box", 2, at, times) for at in (0.1, 0.25, 0.5) for times in (2.0, 9.0))),
         *thorough(*(("fluid", "box", 2, at, 0.7) for at in (0.0, 0.25, 0.5, 0.7)), ("fluid", "symmetry", 2, 0.5, 0.7)),
         *thorough(*((law, "box", 2, 0.1, 9.0) for law in ("fluid_in_tension", "viscous_fluid", "herschel_bulkley"))),
@@ -508,3 +515,30 @@ def test_slivers_at_a_curved_edge_do_not_shorten_explicit_steps(d):
     assert float(ball.volume.min()) < 0.1 * float(ball.volume.max())
     limit, free = (float(mpm.stable_dt(mpm.Scene(grid, LAW, boundary=b), ball)) for b in (floor(0.0, d), ()))
     assert limit > 0.65 * free
+
+
+@pytest.mark.parametrize("method", **ids(METHODS, ("semi_implicit",), ("explicit", "trbdf2")))
+@pytest.mark.parametrize("kind", ["slip", *thorough("sticky")])
+def test_walls_that_hold_a_fluid_beside_a_solid_feel_all_that_they_take(method, kind):
+    """Between nodes and in a corner: their impulse is the change of momentum that nothing else gives, and a start
+    velocity has the derivative of differences. The columns of the solid are held at their nodes."""
+    grid, at, dt = mpm.Grid((16, 14), 0.1, origin=(-4, -4)), 0.02, 2e-3
+    fluid = mpm.fill(mpm.Box((at, at), (at + 0.4, at + 0.3)), grid, density=1e3)
+    solid = mpm.fill(mpm.Box((at + 0.4, at), (at + 0.7, at + 0.3)), grid, density=1e3)
+    body = mpm.join(fluid, solid)
+    body = dataclasses.replace(body, v=jnp.asarray(np.random.default_rng(0).normal(size=body.x.shape)) * 0.01)
+    walls = vessel(kind, (at, at), (at + 0.7, INF))
+    scene = mpm.Scene(grid, (mpm.Fluid(1e4), LAW), boundary=walls, gravity=(0.0, -1.0), boundary_forces=True)
+    start = mpm.prepare(scene, body)
+
+    def after(scale):
+        moving = dataclasses.replace(start, v=scale * start.v)
+        return mpm.step(scene, moving, 0.0, dt, method=method)
+
+    end, info = after(1.0)
+    weight = dt * float(body.mass.sum()) * np.array([0.0, -1.0])
+    change = (body.mass[:, None] * (end.v - body.v)).sum(axis=0)
+    assert_close(-info.boundaries.impulse[0] + weight, change, 1e-6)
+    speed = lambda scale: (after(scale)[0].v ** 2).sum()  # noqa: E731
+    difference = (speed(1 + 1e-4) - speed(1 - 1e-4)) / 2e-4
+    assert_close(jax.grad(speed)(1.0), difference, 1e-5)

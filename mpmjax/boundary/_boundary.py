@@ -52,6 +52,8 @@ class AbstractBoundary(eqx.Module):
     """Whether it has `surfaces` that push material away."""
     sees_faces: ClassVar[bool] = False
     """Whether its `contacts` need the faces of particles though it does not push."""
+    sees_fluids: ClassVar[bool] = False
+    """Whether its `contacts` need the faces of particles where one flows."""
     meets_constraints: ClassVar[bool] = True
     """Whether it may stand in a scene with constrained bodies, such as rigid ones. What it prescribes of a node it
     prescribes of the body."""

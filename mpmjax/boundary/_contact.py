@@ -107,10 +107,10 @@ class AbstractContact(eqx.Module):
     - `shape`: (n, d).
     """
 
-    def known_at_start(self, nodes: AbstractNodes) -> bool:
-        """Whether `likely_held` is the active set of a step whose force is that at its start. Default: it may not
-        be."""
-        del nodes
+    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
+        """Whether `likely_held` is the active set of a step, whose force is that at its start if it is explicit.
+        Default: it may not be."""
+        del nodes, explicit
         return False
 
     def images(self, active: Array) -> tuple[WallImage, ...]:
@@ -208,9 +208,9 @@ class AbstractSpringContact(AbstractContact):
     share: eqx.AbstractVar[Scalar]
     """θ; 1 where forces are those at the start of the step."""
 
-    def known_at_start(self, nodes: AbstractNodes) -> bool:
+    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
         del nodes
-        return True
+        return explicit
 
     @property
     @abc.abstractmethod

@@ -175,10 +175,10 @@ class PlaneContact(AbstractContact):
 
     walls: tuple[WallImage, ...]
     """The walls' maps."""
-    inward: tuple[int, ...] = eqx.field(static=True)
+    inward: tuple[Array | int, ...]
     """The component of each inward normal: +1 or −1."""
-    coefficient: Scalar
-    """Coulomb coefficient [-]."""
+    coefficient: Scalar | None
+    """Coulomb coefficient [-]; None without friction."""
     shut: Bool[Array, "..."]
     """The columns that may be held."""
 
@@ -187,11 +187,11 @@ class PlaneContact(AbstractContact):
         """Direction of the normals."""
         return self.walls[0].axis
 
-    def known_at_start(self, nodes: AbstractNodes) -> bool:
-        """Where nothing across another axis and no other boundary moves the nodes of a column."""
+    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
+        """In explicit steps, where nothing across another axis and no other boundary moves the nodes of a column."""
         planes = (contact for contact in nodes.contacts if isinstance(contact, PlaneContact))
         alone = all(plane.axis == self.axis for plane in planes) and not nodes.potential.mirror.images
-        return alone and not nodes.conditions.holds
+        return explicit and alone and not nodes.conditions.holds
 
     def images(self, active: Array) -> tuple[WallImage, ...]:
         return tuple(replace(wall, held=active[..., k : k + 1]) for k, wall in enumerate(self.walls))
@@ -224,7 +224,9 @@ class PlaneContact(AbstractContact):
 
     def friction(
         self, held: ConstrainedNodes, active: Array, residual: NodeVector
-    ) -> Callable[[NodeVector], NodeVector]:
+    ) -> Callable[[NodeVector], NodeVector] | None:
+        if self.coefficient is None:
+            return None
         limits = self.coefficient * jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0)
         limit = jnp.zeros(len(residual), limits.dtype)
         for wall, part in zip(self.walls, jnp.split(limits, len(self.walls), axis=-1), strict=True):
@@ -254,6 +256,35 @@ class PlaneContact(AbstractContact):
             if isinstance(image, Image | WallImage) and image.axis != self.axis:
                 columns = image.united(columns)
         return columns
+
+
+class HeldPlanes(PlaneContact):
+    """Walls at right angles to an axis that what flows never leaves: their columns are always held."""
+
+    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
+        del nodes, explicit
+        return True
+
+    def likely_held(self, held: ConstrainedNodes, v: NodeVector) -> Array:
+        del held, v
+        return self.shut
+
+    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> Array:
+        del held
+        return jnp.zeros(self.shut.shape, v.dtype)
+
+    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Array:
+        del held
+        return jnp.zeros(self.shut.shape, residual.dtype)
+
+    def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
+        del held
+        return noise, noise
+
+    def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
+        """None: what follows has no force of its own."""
+        del active
+        return jnp.zeros(shape, bool)
 
 
 def column_weight(wall: WallImage, mass: NodeScalar) -> Array:
@@ -332,9 +363,27 @@ class ContactPlane(AbstractPlane):
 
 
 def plane_contact(
-    walls: tuple[WallImage, ...], inward: tuple[int, ...], friction: Scalar, around: Float[Array, "n s"]
+    walls: tuple[WallImage, ...],
+    inward: tuple[Array | int, ...],
+    friction: Scalar | None,
+    around: Float[Array, "n s"],
+    kind: type[PlaneContact] = PlaneContact,
 ) -> PlaneContact:
     """The contact of walls across an axis with the columns around particles whose gap is shut, where the weights of
     those have a sum, shape (n, s)."""
     shut = [wall.column(wall.rows(around[:, k])) > 0 for k, wall in enumerate(walls)]
-    return PlaneContact(walls, inward, friction, jnp.concatenate(shut, axis=-1))
+    return kind(walls, inward, friction, jnp.concatenate(shut, axis=-1))
+
+
+def fluid_walls(
+    axis: int,
+    places: tuple[tuple[Scalar, Array | int], ...],
+    faces: Faces,
+    grid: Grid,
+    window: Int[Array, "d"],
+    *,
+    sticks: bool = False,
+) -> tuple[WallImage, ...]:
+    """The maps of walls across an axis, of coordinates [m] and inward normals, for what flows (see `wall_image`)."""
+    order, filled = len(faces.stencil.basis.knots) - 1, (faces.stencil, faces.flowing_volume)
+    return tuple(wall_image(axis, at, inward, grid, window, order, filled, sticks=sticks) for at, inward in places)

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, NodeScalar, NodeVector, ParticleVector, Scalar
@@ -92,6 +93,21 @@ class Faces(eqx.Module):
     """θ, the share of the step's displacement at which the integrator evaluates forces; 1 at its start."""
     explicit: bool = eqx.field(static=True, default=True)
     """Whether the step is explicit."""
+
+    @property
+    def flowing(self) -> Bool[np.ndarray, "p"]:
+        """The particles of materials that flow, shape (p,)."""
+        return np.repeat([shape.flows for shape in self.shapes], [len(shape.half) for shape in self.shapes])
+
+    @property
+    def flowing_volume(self) -> Float[Array, "p"]:
+        """The volume of each of these [m^d], shape (p,), zero of others."""
+        d, parts = self.x.shape[1], []
+        for shape in self.shapes:
+            F = shape.deformation
+            volume = (2 * shape.half) ** d * (F if F.ndim == 1 else la.determinant(F))
+            parts.append(volume if shape.flows else jnp.zeros_like(volume))
+        return jnp.concatenate(parts)
 
     def stiffness_at(self, approach: Float[Array, "p"]) -> Float[Array, "p"]:
         """k_p = A α (M + ρ0 max(w, 0)²)/dx [N/m], shape (p,), at the velocity of approach w [m/s]: as in a shock, so

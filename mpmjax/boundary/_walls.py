@@ -12,12 +12,11 @@ from mpmjax._types import Array, Bool, Corner, Float, Int, NodeVector, ParticleV
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._planes import SHUT, plane_contact
+from mpmjax.boundary._planes import SHUT, HeldPlanes, fluid_walls, plane_contact
 from mpmjax.boundary._surface_contact import SIGNS, Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import Motion
-from mpmjax.potential import wall_image
 
 
 class AbstractBox(AbstractBoundary):
@@ -50,13 +49,6 @@ class AbstractBox(AbstractBoundary):
         del t
         return 0.0
 
-    def inward_normal(self, nodes: NodeVector, spacing: Scalar) -> NodeVector:
-        """The inward normal's component in each direction: +1 at and below `lower`, −1 at and above `upper`, else 0."""
-        margin = ON_THE_WALL * spacing
-        below = nodes <= jnp.asarray(self.lower, nodes.dtype) + margin
-        above = nodes >= jnp.asarray(self.upper, nodes.dtype) - margin
-        return jnp.where(below, 1, jnp.where(above, -1, 0)).astype(nodes.dtype)
-
     def passed(
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
     ) -> Bool[Array, "p"]:
@@ -88,8 +80,57 @@ class AbstractBox(AbstractBoundary):
         )
 
 
-class StickyBox(AbstractBox):
+class AbstractHoldingBox(AbstractBox):
+    """Walls from which material cannot part. They hold the nodes at and behind them, and what flows, while they rest,
+    by columns of nodes (see `wall_image`), so that it stays at rest."""
+
+    motion: eqx.AbstractVar[Motion | None]
+    """How the walls move together; None for not at all."""
+    sticks: ClassVar[bool]
+    """Whether they hold the whole velocity."""
+    sees_fluids: ClassVar[bool] = True
+
+    def __check_init__(self):
+        require_fields(self)
+        require(
+            self.motion is None or self.motion.dim == self.dim,
+            f"{type(self).__name__}'s motion must have {self.dim} coordinates, got {self.motion and self.motion.dim}.",
+        )
+
+    def displacement(self, t: Scalar) -> Float[Array, "d"] | float:
+        return 0.0 if self.motion is None else self.motion.at(t)
+
+    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
+        """v·n = V·n or, where it sticks, v = V."""
+        place = nodes if reference or self.motion is None else nodes - self.displacement(t)
+        below = place <= jnp.asarray(self.lower, nodes.dtype) + ON_THE_WALL * spacing
+        fixed = below | (place >= jnp.asarray(self.upper, nodes.dtype) - ON_THE_WALL * spacing)
+        if self.sticks:
+            fixed = jnp.broadcast_to(fixed.any(axis=1, keepdims=True), nodes.shape)
+        return held_by_wall(fixed, self.motion, nodes, t, dt)
+
+    def contacts(
+        self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+    ) -> tuple[AbstractContact, ...]:
+        """Two walls an axis that hold the columns of nodes around what flows."""
+        if faces is None or self.motion is not None or not faces.flowing.any():
+            return ()
+        around, contacts = None, []
+        if not faces.flowing.all():
+            flowing = jnp.broadcast_to(faces.flowing, (2, len(faces.x))).astype(faces.x.dtype)
+            around = scatter(faces.stencil, flowing, None, grid.size)
+        for axis in range(self.dim):
+            places = (jnp.asarray(self.lower)[axis], 1), (jnp.asarray(self.upper)[axis], -1)
+            walls = fluid_walls(axis, places, faces, grid, window, sticks=self.sticks)
+            every = jnp.ones((grid.size, 2)) if around is None else around
+            contacts.append(plane_contact(walls, SIGNS, None, every, HeldPlanes))
+        return tuple(contacts)
+
+
+class StickyBox(AbstractHoldingBox):
     """Walls that hold what touches them: the whole velocity is zero at and beyond them, exactly, also after a solve.
+
+    A fluid is held by columns of nodes, as in a `SlipBox`.
 
     Args:
         lower: position of the lower wall in each direction [m], (d,); −inf for none.
@@ -100,28 +141,20 @@ class StickyBox(AbstractBox):
     lower: Corner
     upper: Corner
     motion: Motion | None = None
-
-    def __check_init__(self):
-        require_fields(self)
-        _check_motion(self, self.motion)
-
-    def displacement(self, t: Scalar) -> Float[Array, "d"] | float:
-        return 0.0 if self.motion is None else self.motion.at(t)
-
-    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """v = V."""
-        place = nodes if reference or self.motion is None else nodes - self.displacement(t)
-        held = (self.inward_normal(place, spacing) != 0).any(axis=1, keepdims=True)
-        fixed = jnp.broadcast_to(held, nodes.shape)
-        return held_by_wall(fixed, self.motion, nodes, t, dt)
+    sticks: ClassVar[bool] = True
 
 
-class SlipBox(AbstractBox):
+class SlipBox(AbstractHoldingBox):
     """Walls along which the material slides freely and from which it cannot part: the normal velocity is zero at and
     beyond them, exactly, also after a solve.
 
     Accurate to first order in the spacing. A wall at a multiple of half a spacing is better written as a
     `SymmetryPlane`, which is the same wall to second order: frictionless, and never left.
+
+    A fluid is held by columns of nodes whose normal velocity is linear across the wall and zero on it, wherever that
+    lies, so that it stays at rest.
+
+    *When it breaks*: a box that moves holds fluids at nodes too, and they press on it by a tenth too much.
 
     Args:
         lower: position of the lower wall in each direction [m], (d,); −inf for none.
@@ -132,19 +165,7 @@ class SlipBox(AbstractBox):
     lower: Corner
     upper: Corner
     motion: Motion | None = None
-
-    def __check_init__(self):
-        require_fields(self)
-        _check_motion(self, self.motion)
-
-    def displacement(self, t: Scalar) -> Float[Array, "d"] | float:
-        return 0.0 if self.motion is None else self.motion.at(t)
-
-    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """v·n = V·n."""
-        place = nodes if reference or self.motion is None else nodes - self.displacement(t)
-        fixed = self.inward_normal(place, spacing) != 0
-        return held_by_wall(fixed, self.motion, nodes, t, dt)
+    sticks: ClassVar[bool] = False
 
 
 class SeparatingBox(AbstractBox):
@@ -187,7 +208,7 @@ class SeparatingBox(AbstractBox):
         del t, dt, push_time
         above = (x - jnp.asarray(self.lower, x.dtype)).T
         below = (jnp.asarray(self.upper, x.dtype) - x).T
-        normals = [jnp.zeros_like(x.T).at[axis].set(1) for axis in range(self.dim)]
+        normals = [jnp.zeros_like(x.T).at[axis].set(1) for axis in range(x.shape[1])]
         return tuple(
             Surface(above[axis], normal, self.friction, axis=axis, opposite=below[axis])
             for axis, normal in enumerate(normals)
@@ -202,7 +223,7 @@ class SeparatingBox(AbstractBox):
         surfaces = tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
         if not any(shape.flows for shape in faces.shapes):
             return surfaces
-        flowing = np.repeat([shape.flows for shape in faces.shapes], [len(shape.half) for shape in faces.shapes])
+        flowing = faces.flowing
         shut = jnp.stack([flowing & (surface.gap <= SHUT * faces.spacing) for surface in surfaces])
         # one sum at the nodes for all walls
         around = scatter(faces.stencil, shut.reshape(-1, len(flowing)).astype(faces.x.dtype), None, grid.size)
@@ -210,14 +231,8 @@ class SeparatingBox(AbstractBox):
         for axis, surface in enumerate(surfaces):
             if not (faces.explicit and flowing.all()):
                 contacts.append(replace(surface, beside=~shut[axis]))
-            stencil = faces.stencil.along(axis)
-            volume = jnp.where(flowing, 2 * faces.width(surface.normal)[0], 0) ** self.dim
-            slope = scatter(stencil, None, volume[None, None], stencil.basis.shape[0])[:, 0]
-            corners, order = ((self.lower, 1), (self.upper, -1)), len(stencil.basis.knots) - 1
-            walls = tuple(
-                wall_image(axis, jnp.asarray(corner)[axis], inward, grid, window, order, slope)
-                for corner, inward in corners
-            )
+            places = (jnp.asarray(self.lower)[axis], 1), (jnp.asarray(self.upper)[axis], -1)
+            walls = fluid_walls(axis, places, faces, grid, window)
             contacts.append(plane_contact(walls, SIGNS, self.friction, around[:, 2 * axis : 2 * axis + 2]))
         return tuple(contacts)
 
@@ -228,10 +243,3 @@ class SeparatingBox(AbstractBox):
 
     def check(self, grid: Grid, *, total: bool) -> None:
         refuse_contact(total)
-
-
-def _check_motion(box: AbstractBox, motion: Motion | None) -> None:
-    require(
-        motion is None or motion.dim == box.dim,
-        f"{type(box).__name__}'s motion must have {box.dim} coordinates, got {motion and motion.dim}.",
-    )

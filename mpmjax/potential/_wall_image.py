@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
-from mpmjax.discretisation import Grid
+from mpmjax.discretisation import Grid, Stencil
 
 
 class WallImage(eqx.Module):
@@ -38,6 +38,8 @@ class WallImage(eqx.Module):
     """The first row from behind that has a tangential velocity of its own."""
     held: Bool[Array, "..."] | None = None
     """The columns where the wall holds; None for all of them."""
+    sticks: bool = eqx.field(static=True, default=False)
+    """Whether the rows behind b have its whole velocity times B."""
 
     def blocks(self, field: Array) -> Array:
         """A field of shape (n,) or (n, c), or blocks, as blocks."""
@@ -54,7 +56,8 @@ class WallImage(eqx.Module):
     def with_rows(self, field: Array, rows: Array) -> Array:
         """A field with other rows."""
         blocks, axis, length = self.blocks(field), self.axis + 1, rows.shape[self.axis + 1]
-        # Laid into zeros first: XLA writes a slice over the field in place, of which the rows' own program still reads.
+        # Laid into zeros first: XLA writes a slice over the field in place, of which the rows' own program still reads,
+        # behind an optimization_barrier too.
         laid = jax.lax.dynamic_update_slice_in_dim(
             jnp.zeros_like(blocks), rows, self.start, axis, allow_negative_indices=False
         )
@@ -97,6 +100,7 @@ class WallImage(eqx.Module):
 
     def _components(self, normal: Bool[Array, "c"], share: Array) -> tuple[Array, Array]:
         """Which rows follow b in each component, and by which factor."""
+        normal = normal | self.sticks
         return jnp.where(normal, self.follows, self.tied), jnp.where(normal, share, 1)
 
     def _copied(self, field: Array, follows: Array, factor: Array | int) -> Array:
@@ -112,39 +116,52 @@ class WallImage(eqx.Module):
 def wall_image(
     axis: int,
     position: Scalar,
-    inward: int,
+    inward: Array | int,
     grid: Grid,
     window: Int[Array, "d"],
     order: int,
-    slope: Float[Array, "m"] | None = None,
+    filled: tuple[Stencil, Float[Array, "p"]] | None = None,
+    *,
+    sticks: bool = False,
 ) -> WallImage:
-    """The map of a wall at any coordinate [m] along an axis, for a kernel of this order.
+    """The map of a wall at any coordinate [m] along an axis, for a kernel of this order; `inward` is the component of
+    its inward normal, +1 or −1.
 
     With ξ the distance of a node before the wall, b is the nearest one before it that no kernel at the wall passes:
     ξ_b ≥ ½ for quadratic kernels. Nodes behind b have its normal velocity times B = ξ/ξ_b, so that it is zero on the
     wall, and fields that are linear across it are in the map: forces of a uniform pressure, which have neither sum nor
     first moment about the wall, vanish. Nodes more than a quarter of a spacing behind the wall have the tangential
-    velocity of b. With the wall on a node this is the mirror, and half-way between nodes too but for cubic kernels.
+    velocity of b; behind a wall that `sticks` all have B times that too. With the wall on a node this is the mirror,
+    and half-way between nodes too but for cubic kernels.
 
-    Sums over particles are no integrals: by `slope`, the volumes of particles times the gradient's factors along the
-    axis, summed at the nodes of the axis [m^(d-1)], shape (m,), the wall is moved by up to 0.02 spacings to where a
-    uniform pressure has no moment.
+    Sums over particles are no integrals: by `filled`, the stencil of particles and the volumes that press [m^d], shape
+    (p,), a wall that is at no multiple of half a spacing is moved by up to 0.02 spacings to where a uniform pressure
+    has no moment.
     """
     near, length = 1e-3, grid.shape[axis]  # what is as near to ½ or −¼ counts as there
     count = min(order + 3, length)  # from b to the nodes of what is a spacing behind the wall
     place = jnp.asarray(position) / grid.spacing  # then from the window's first node, of a wall that is none far off
     place = jnp.clip(place - window[axis].astype(place.dtype), -length, 2 * length)
     base = inward * (jnp.floor(inward * place + max(order - 1, 1) / 2 - near).astype(jnp.int32) + 1)
-    start = jnp.clip(base - count + 1 if inward > 0 else base, 0, length - count)
+    start = jnp.clip(jnp.where(inward > 0, base - count + 1, base), 0, length - count)
     j = start + jnp.arange(count, dtype=jnp.int32)
     before, of_base = (inward * (row.astype(place.dtype) - place) for row in (j, base))
     follows, stays = inward * (j - base) < 0, before > -0.25 - near
-    if slope is not None:
-        force = jnp.where(follows | (j == base), jax.lax.dynamic_slice_in_dim(slope, start, count), 0)
-        total = force.sum()
-        middle = jnp.where(total == 0, 0, (force * before).sum() / jnp.where(total == 0, 1, total))
-        middle = jnp.clip(middle, -0.02, 0.02)
-        before, of_base = before - middle, of_base - middle
+    if filled is not None:
+        along, volume = filled[0].along(axis), filled[1]
+
+        def middle() -> Array:
+            force = moment = jnp.zeros_like(volume)
+            for n, slope in enumerate(along.weight_derivatives[0]):
+                node = along.first[0] + n
+                part = jnp.where(inward * (node - base) <= 0, slope, 0)
+                force, moment = force + part, moment + part * inward * (node.astype(place.dtype) - place)
+            total, first = jnp.stack([force, moment]) @ volume  # a product, of which XLA makes vectors
+            return jnp.clip(jnp.where(total == 0, 0, first / jnp.where(total == 0, 1, total)), -0.02, 0.02)
+
+        aside = jnp.abs(2 * place - jnp.round(2 * place)) > 2 * near
+        shift = jax.lax.cond(aside, middle, lambda: jnp.zeros((), volume.dtype))
+        before, of_base = before - shift, of_base - shift
     by_row = [count if k == axis + 1 else 1 for k in range(grid.dim + 2)]
     return WallImage(
         shape=grid.shape,
@@ -157,4 +174,5 @@ def wall_image(
         share=jnp.where(j == base, 1, jnp.where(follows, before / of_base, 0)).reshape(by_row),
         tied=(follows & ~stays).reshape(by_row),
         first=(stays & (before - 1 <= -0.25 - near)).reshape(by_row),
+        sticks=sticks,
     )

@@ -190,7 +190,7 @@ def _unfit_for_fluids(boundary: AbstractBoundary, dx: float) -> str | None:
     if isinstance(shape, HalfSpace):
         point, normal = (np.asarray(jnp.asarray(a), float) for a in (shape.point, shape.normal))
         places = point[normal != 0].tolist() if np.count_nonzero(normal) == 1 else []
-    if getattr(boundary, "motion", None) is not None or not places:
+    if getattr(boundary, "motion", None) is not None or boundary.sees_fluids or not places:
         return None
     if boundary.pushes:
         stirs = "pushes the faces of a fluid and so stirs it, by a tenth or more of the pressure at its floor: across"

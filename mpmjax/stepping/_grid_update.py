@@ -111,7 +111,7 @@ def find_active_set(
     active = tuple(contact.likely_held(nothing_held, predictor) for contact in nodes.contacts)
     cost = SolveInfo(residual=zero, report=zero)
     # the force of an explicit step is known at its start, and with it which gaps are shut
-    if method.is_explicit and all(contact.known_at_start(nodes) for contact in nodes.contacts):
+    if all(contact.known_at_start(nodes, method.is_explicit) for contact in nodes.contacts):
         return active, guess, cost, none
     first = (active, guess, cost, jnp.asarray(True), none)
     active, guess, cost, _, count = jax.lax.while_loop(lambda s: s[3] & (s[4] < SWEEPS), sweep, first)

@@ -239,7 +239,8 @@ def with_boundaries(
         place = jnp.where(slid[:, None] & nodes.occupied, moved, conditions.colliders.position)
         conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
     faces = None
-    if any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
+    flows = any(law.flows for law in scene.laws)
+    if any(wall.pushes or wall.sees_faces or (flows and wall.sees_fluids) for wall in scene.boundary):
         faces = faces_of(scene, particles, potential, t, dt, force_at)
     each = enumerate(scene.boundary)
     brought = [(n, contact) for n, boundary in each for contact in boundary.contacts(faces, grid, window, t, dt)]
