@@ -2,9 +2,11 @@
 
     python benchmarks/accuracy.py [--quick]
     python benchmarks/accuracy.py --column
+    python benchmarks/accuracy.py --bent
 
 Prints each series with its observed orders, and writes docs/accuracy.csv and docs/accuracy.png. `--quick` leaves out
-the finest grids and writes nothing. `--column` prints the table of a column under its own weight, by gradient operator.
+the finest grids and writes nothing. `--column` prints the table of a column under its own weight, by gradient operator,
+`--bent` that of a bar held at one end, by what holds it.
 """
 
 import argparse
@@ -20,7 +22,7 @@ import numpy as np
 from matplotlib.ticker import NullLocator
 
 import mpmjax as mpm
-from mpmjax.verification import AxisAligned, Column, Ends, StandingWave, Vortex, errors, orders
+from mpmjax.verification import AxisAligned, BentBar, Column, Ends, StandingWave, Vortex, errors, orders
 
 DOCS = Path(__file__).parents[1] / "docs"
 FLIP, SPLINE = mpm.FLIP(1.0), mpm.SplineGradient()
@@ -107,12 +109,29 @@ def column(quick: bool) -> None:
     ):
         choices = {"kernel": mpm.BSpline(order), "description": description, "gradient": gradient}
         e = np.array([Column(load, shift).errors(n, **choices) for n in cells])
-        shown = [
-            f"{', '.join(f'{x:.1e}' for x in field)} | {', '.join(f'{o:.1f}' for o in orders(field, cells))}"
-            for field in e.T
-        ]
         name = f"{type(description).__name__}, {type(gradient).__name__}, order {order}, load {load}, shift {shift}"
-        print(f"| {name} | {' | '.join(shown)} |", flush=True)
+        print_orders(name, e, cells)
+
+
+def bent(quick: bool) -> None:
+    """Print errors and orders of displacement and stress of a bar that is bent, as rows of docs/accuracy.md."""
+    cells = (2, 4) if quick else (2, 4, 8, 16)
+    grip = mpm.Grip(mpm.Box((-9.0, -9.0), (0.0, 9.0)), mpm.Motion((0.0,), ((0.0, 0.0),)))
+    for order, held in itertools.product((2, 3), (grip, mpm.ClampPlane(0, 0.0))):
+        print_orders(
+            f"{type(held).__name__}, order {order}",
+            np.array([BentBar().errors(n, held, kernel=mpm.BSpline(order)) for n in cells]),
+            cells,
+        )
+
+
+def print_orders(name: str, e: np.ndarray, cells: tuple[int, ...]) -> None:
+    """Print errors of displacement and stress, shape (g, 2), and their orders."""
+    shown = [
+        f"{', '.join(f'{x:.1e}' for x in field)} | {', '.join(f'{o:.1f}' for o in orders(field, cells))}"
+        for field in e.T
+    ]
+    print(f"| {name} | {' | '.join(shown)} |", flush=True)
 
 
 def draw(series: list[Series]) -> None:
@@ -136,11 +155,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="leave out the finest grids, write nothing")
     parser.add_argument("--column", action="store_true", help="the table of a column under its own weight alone")
+    parser.add_argument("--bent", action="store_true", help="the table of a bar that is bent alone")
     given = parser.parse_args()
     quick = given.quick
     jax.config.update("jax_enable_x64", True)
-    if given.column:
-        column(quick)
+    if given.column or given.bent:
+        column(quick) if given.column else bent(quick)
         return
     series = []
     for s in measure(quick):

@@ -58,8 +58,8 @@ def closed(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return -SIDE * stress - inertia / 3, -SIDE * stress + inertia / 6, -SIDE * LAM * np.log(s)
 
 
-def twisted(across: int, order: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Angles, the torques on both grips, shape (f, 2), and the number of particles."""
+def twisted(across: int, order: int, clamped: bool) -> tuple[np.ndarray, np.ndarray, int]:
+    """Angles, the torques on both grips or clamps, shape (f, 2), and the number of particles."""
     dx = 2 * RADIUS / across
     half = across // 2 + 3
     grid = mpm.Grid((2 * half, 2 * half, round(LENGTH / dx) + 6), dx, origin=(-half, -half, -3))
@@ -70,6 +70,8 @@ def twisted(across: int, order: int) -> tuple[np.ndarray, np.ndarray, int]:
         mpm.Grip(mpm.Box((-9.0, -9.0, -9.0), (9.0, 9.0, 0.0)), mpm.Motion((0.0, t1), still)),
         mpm.Grip(mpm.Box((-9.0, -9.0, LENGTH), (9.0, 9.0, 9.0)), turn),
     )
+    if clamped:
+        grips = mpm.ClampPlane(2, 0.0), mpm.ClampPlane(2, LENGTH, "below", turn)
     choices = {"kernel": mpm.BSpline(order), "gradient": mpm.SplineGradient(), "description": mpm.TotalLagrangian()}
     scene = mpm.Scene(grid, LAW, boundary=grips, boundary_forces=True, **choices)
     run = mpm.simulate(scene, rod, t1=t1, dt=t1 / steps, method=mpm.BackwardEuler(), save_every=1)
@@ -94,15 +96,19 @@ def main(quick: bool) -> None:
     left.set(xlabel="time [ms]", ylabel="force [kN/m]", title="block pressed by 20 % and released")
     left.legend(frameon=False, fontsize=9)
     unit = MU * np.pi * RADIUS**4 / 2 / LENGTH
-    for across, order in ((4, 2), (4, 1)) if quick else ((4, 2), (8, 2), (8, 1)):
-        angle, torque, count = twisted(across, order)
+    cases = ((4, 2, False), (4, 2, True)) if quick else ((4, 2, False), (8, 2, False), (8, 1, False))
+    for across, order, clamped in cases if quick else (*cases, (4, 2, True), (8, 2, True)):
+        angle, torque, count = twisted(across, order, clamped)
         share = torque * np.array([1, -1]) / (unit * angle[:, None])
         print(
-            f"twisted, {across:2} cells across, kernel of order {order}, {count} particles: torque over closed form, "
-            f"grip at rest {share[0, 0]:.4f} to {share[-1, 0]:.4f}, other {share[0, 1]:.4f} to {share[-1, 1]:.4f}",
+            f"twisted by {'clamps' if clamped else 'grips'}, {across:2} cells across, kernel of order {order}, {count} "
+            f"particles: torque over closed form, at rest {share[0, 0]:.4f} to {share[-1, 0]:.4f}, other "
+            f"{share[0, 1]:.4f} to {share[-1, 1]:.4f}",
             flush=True,
         )
-        if order == 2:
+        if clamped:
+            right.plot(angle, -torque[:, 1] / 1e3, "o", ms=3, mfc="none", label=f"{across} cells, clamped")
+        elif order == 2:
             right.plot(angle, -torque[:, 1] / 1e3, "o", ms=3, label=f"{across} cells across")
         else:
             right.plot(angle, -torque[:, 1] / 1e3, "kx", ms=5, label=f"{across} cells, linear kernel")

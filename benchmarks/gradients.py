@@ -40,16 +40,17 @@ NAMES = {SPLINE: "spline", MLS: "moving least squares"}
 
 
 def choices(kernels: tuple[int, ...] = (2, 3), finer: int = 4) -> Iterator[tuple[str, dict]]:
-    """Each choice, with its name; those of the defaults again with more particles."""
+    """Each choice, with its name; those of the defaults, and the cubic spline in motion, again with more particles."""
     for description in (TOTAL, UPDATED):
         place = "total" if description is TOTAL else "updated"
         for order in kernels:
             for gradient in (SPLINE, MLS):
                 name = f"{place}, {NAMES[gradient]}, {'quadratic' if order == 2 else 'cubic'}"
                 yield name, {"description": description, "gradient": gradient, "kernel": mpm.BSpline(order)}
-    for description, gradient in ((TOTAL, SPLINE), (UPDATED, MLS)) if finer else ():
-        name = f"{'total' if description is TOTAL else 'updated'}, {NAMES[gradient]}, quadratic, {finer} a side"
-        yield name, {"description": description, "gradient": gradient, "per_side": finer}
+    for description, gradient, order in ((TOTAL, SPLINE, 2), (UPDATED, MLS, 2), (UPDATED, SPLINE, 3)) if finer else ():
+        place = "total" if description is TOTAL else "updated"
+        name = f"{place}, {NAMES[gradient]}, {'quadratic' if order == 2 else 'cubic'}, {finer} a side"
+        yield name, {"description": description, "gradient": gradient, "kernel": mpm.BSpline(order), "per_side": finer}
 
 
 def moving(

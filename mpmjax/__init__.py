@@ -22,6 +22,7 @@ from mpmjax import (
     stepping as stepping,
 )
 from mpmjax.boundary import (
+    ClampPlane as ClampPlane,
     ContactPlane as ContactPlane,
     Grip as Grip,
     RigidPart as RigidPart,

@@ -36,8 +36,9 @@ BOUNDARIES = {name: boundary for name, boundary in OF_BUDGETS.items() if boundar
         mpm.StickyCollider(mpm.geometry.Capsule((0.0, 0.3), (0.1, 0.3), 0.06), MOVED),
     ),
     "between planes": (mpm.SymmetryPlane(0, 0.0), mpm.SymmetryPlane(0, 0.3, keep="below"), mpm.SymmetryPlane(1, 0.0)),
+    "a clamp and a plane": (mpm.ClampPlane(0, 0.0), mpm.SymmetryPlane(1, 0.0)),
 }
-HELD = ("walls", "planes", "grip", "walls and planes", "between planes")
+HELD = ("walls", "planes", "grip", "walls and planes", "between planes", "a clamp and a plane")
 """What the total description knows."""
 
 

@@ -25,6 +25,7 @@ MODULES = {
     "flip": mpm.FLIP(0.9),
     "grid": mpm.Grid((8, 8), 0.1),
     "symmetry plane": mpm.SymmetryPlane(0, 0.1),
+    "clamp plane": mpm.ClampPlane(0, 0.1, motion=TURN),
     "contact plane": mpm.ContactPlane(0, 0.1, friction=0.3),
     "sticky box": mpm.StickyBox((0.0, 0.0), (1.0, 1.0)),
     "slip box": mpm.SlipBox((0.0, 0.0), (1.0, 1.0)),

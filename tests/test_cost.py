@@ -171,6 +171,7 @@ HELD = {
     "slip": mpm.SlipBox((-0.2, -0.2), (0.8, 0.8)),
     "grip": mpm.Grip(mpm.Box((0.3, -1.0), (1.0, 1.0)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.0)))),
     "mirrored": mpm.SymmetryPlane(0, 0.0),
+    "clamped": mpm.ClampPlane(0, 0.0),
     "sticky collider": mpm.StickyCollider(mpm.Ball((0.4, 0.4), 0.15)),
     "slip collider": mpm.SlipCollider(mpm.HalfSpace((0.0, 0.0), (1.0, 2.0))),
 }

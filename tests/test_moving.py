@@ -82,8 +82,13 @@ MOVING = {
 )
 def test_a_plane_that_moves_is_one_at_rest_seen_by_somebody_who_moves(name, d, description):
     """A shaken block on a plane that moves evenly, against the same at rest: positions, velocities and forces."""
-    (method, transfer), V, found = MOVING[name], jnp.zeros(d).at[-1].set(0.6), []
-    for plane, drift in ((mpm.SymmetryPlane(d - 1, 0.0), 0 * V), (PLANES[d], V)):
+    assert_seen_alike(name, mpm.SymmetryPlane(d - 1, 0.0), PLANES[d], jnp.zeros(d).at[-1].set(0.6), description)
+
+
+def assert_seen_alike(name, still, moves, V, description):
+    """A block on a plane at rest, and on the same plane at the velocity V, move and push alike."""
+    (method, transfer), d, found = MOVING[name], len(V), []
+    for plane, drift in ((still, 0 * V), (moves, V)):
         scene, particles = shaken(d, boundary=plane, transfer=transfer, description=description)
         dt = 0.3 * explicit_limit(scene)
         particles = dataclasses.replace(particles, v=particles.v + drift)
@@ -92,6 +97,37 @@ def test_a_plane_that_moves_is_one_at_rest_seen_by_somebody_who_moves(name, d, d
         found.append((particles.x - 4 * dt * drift, particles.v - drift, info.boundaries.impulse))
     for a, b in zip(*found, strict=True):
         assert_close(a, b, 1e-9)
+
+
+@pytest.mark.parametrize("name", **ids({name: name for name in MOVING}, "explicit"))
+def test_a_clamp_that_moves_is_one_at_rest_seen_by_somebody_who_moves(name):
+    """Along it too."""
+    V, motion = jnp.asarray([0.2, 0.6]), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.2, 0.6)))
+    still, moves = (mpm.ClampPlane(1, 0.0, motion=way) for way in (None, motion))
+    assert_seen_alike(name, still, moves, V, mpm.TotalLagrangian())
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_a_block_between_clamps_that_turn_together_turns_as_a_rigid_body(d):
+    """On nodes and half-way between; neither is pushed nor twisted."""
+    turn = (0.3,) if d == 2 else ((0.1, 0.3, 0.2),)
+    motion = mpm.RigidMotion((0.0, 3e3), ((0.0,) * d, (0.02,) * d), (0 * np.asarray(turn[0]), *turn), (0.1,) * d)
+    grid = mpm.Grid((9,) * d, 0.1, origin=(-3,) * d)
+    box = mpm.Box((0.0,) * d, (0.3,) * (d - 1) + (0.25,))
+    clamps = (mpm.ClampPlane(d - 1, 0.0, motion=motion), mpm.ClampPlane(d - 1, 0.25, "below", motion))
+    choices = {"description": mpm.TotalLagrangian(), "boundary_forces": True}
+    scene = mpm.Scene(grid, LAWS["neo_hookean"], boundary=clamps, **choices)
+    particles = mpm.fill(box, grid, density=1e3)
+    run = mpm.simulate(scene, particles, t1=3e3, dt=1e3, method=METHODS["backward_euler"], save_every=3)
+    assert_close(run.final.x, motion.place(particles.x, 3e3), 1e-9)
+    _, force, torque = run.boundary_forces()
+    np.testing.assert_allclose(force, 0, atol=1e-5 * 1e4 * 0.3 ** (d - 1))
+    np.testing.assert_allclose(torque, 0, atol=1e-5 * 1e4 * 0.3**d)
+
+
+def test_a_clamp_moves_in_the_total_description_only():
+    with pytest.raises(ValueError, match="moves in the total description only"):
+        block(2, boundary=mpm.ClampPlane(1, 0.0, motion=up(2, 0.6)))
 
 
 @pytest.mark.thorough

@@ -26,6 +26,7 @@ FEATURES = {
     "separating box": {"boundary": mpm.SeparatingBox(LOW, HIGH, friction=0.1)},
     "symmetry plane": {"boundary": mpm.SymmetryPlane(1, 0.0)},
     "moving plane": {"boundary": mpm.SymmetryPlane(1, 0.0, motion=STAY)},
+    "clamp plane": {"boundary": mpm.ClampPlane(1, 0.0)},
     "contact plane": {"boundary": mpm.ContactPlane(1, 0.0, friction=0.1)},
     "sticky collider": {"boundary": mpm.StickyCollider(FOOT)},
     "slip collider": {"boundary": mpm.SlipCollider(UNDER, STAY)},

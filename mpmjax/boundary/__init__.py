@@ -45,7 +45,11 @@ from mpmjax.boundary._impulses import (
     received_impulses as received_impulses,
     taken_by_mirrors as taken_by_mirrors,
 )
-from mpmjax.boundary._planes import ContactPlane as ContactPlane, SymmetryPlane as SymmetryPlane
+from mpmjax.boundary._planes import (
+    ClampPlane as ClampPlane,
+    ContactPlane as ContactPlane,
+    SymmetryPlane as SymmetryPlane,
+)
 from mpmjax.boundary._regions import Grip as Grip, RigidPart as RigidPart
 from mpmjax.boundary._surface_contact import (
     EXPLICIT_STIFFNESS as EXPLICIT_STIFFNESS,

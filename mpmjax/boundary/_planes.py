@@ -1,4 +1,4 @@
-"""Symmetry and contact planes, beyond which nodes are mirror images."""
+"""Symmetry, clamp and contact planes, beyond which nodes are mirror images."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +15,7 @@ from mpmjax.boundary._contact import AbstractContact, AbstractNodes, Constrained
 from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
 from mpmjax.discretisation import Grid, scatter
-from mpmjax.geometry import Motion
+from mpmjax.geometry import AbstractMotion, Motion
 from mpmjax.potential import Image, MirrorPlace, WallImage, mirror_image, wall_image
 
 SHUT = 1e-2
@@ -77,7 +77,7 @@ class AbstractPlane(AbstractBoundary):
 
     def passed(
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
-    ) -> Bool[Array, "p"]:
+    ) -> Bool[Array, "p"] | None:
         """Which particles passed the plane: those that end more than half a spacing beyond it, among others
         (`crossed`)."""
         del reach
@@ -156,6 +156,82 @@ class SymmetryPlane(AbstractPlane):
         """The mirror image of this plane, in all columns."""
         velocity = None if self.motion is None else self.motion.velocity(t, dt)[self.axis]
         return (replace(mirror_image(self.axis, self.position, self.keep, grid, window), velocity=velocity),)
+
+
+class ClampPlane(AbstractPlane):
+    """A plane to which the body's face is fixed: a grip that holds at its surface.
+
+    Nodes beyond it have the opposite of their image's velocity, so that the spline vanishes on the plane: second order
+    in the spacing, where a `Grip` of whole nodes lets the body yield up to half a spacing beyond the face and is first.
+
+    With a motion, in the total description, nodes on the plane have its velocity V and those beyond 2V minus their
+    image's.
+
+    *When it breaks*: the body must end at the plane; what lies beyond would be moved the other way.
+
+    Args:
+        axis: direction of the normal, 0 to d − 1.
+        position: coordinate of the plane before it moves [m], a multiple of half a spacing.
+        keep: which side holds the material: "above" or "below" the plane.
+        motion: how it moves: a `Motion`, or a `RigidMotion`, which turns too. Default: not at all.
+    """
+
+    axis: int = eqx.field(static=True)
+    position: Scalar
+    keep: str = eqx.field(static=True, default="above")
+    motion: Motion | AbstractMotion | None = None
+    plain_box: ClassVar[str] = "Grip"
+    meets_constraints: ClassVar[bool] = False
+
+    def __check_init__(self):
+        require_fields(self)
+
+    @property
+    def dim(self) -> int | None:
+        return None if self.motion is None else self.motion.dim
+
+    def check(self, grid: Grid, *, total: bool) -> None:
+        """A motion needs the total description."""
+        AbstractPlane.check(self, grid, total=total)
+        require(
+            self.motion is None or total,
+            "A ClampPlane moves in the total description only, whose nodes stay with the body: take that, or a Grip.",
+        )
+
+    def walls(self) -> tuple[Wall, ...]:
+        """Where it starts."""
+        return (Wall(self.axis, float(self.position), self.inward, mirrored=self.motion is None),)
+
+    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
+        """v = V on the plane's own nodes."""
+        del reference
+        on = jnp.abs(nodes[:, self.axis] - self.position) <= ON_THE_WALL * spacing
+        fixed = jnp.broadcast_to(on[:, None], nodes.shape)
+        if self.motion is None:
+            return Conditions(fixed, jnp.zeros_like(nodes), moves=False)
+        return Conditions(fixed, jnp.where(fixed, self.motion.velocity_of(nodes, t, dt), 0))
+
+    def mirror_images(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> tuple[Image, ...]:
+        """The image in which all components are odd, in all columns."""
+        velocity, image = None, mirror_image(self.axis, self.position, self.keep, grid, window)
+        if self.motion is not None:
+            nodes = grid.nodes(window)
+            velocity = self.motion.velocity_of(nodes.at[:, self.axis].set(self.position), t, dt)
+        return (replace(image, velocity=velocity, holds_all=True),)
+
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"] | None:
+        """Nothing passes one that moves, being fixed to it."""
+        return AbstractPlane.passed(self, start, end, spacing, t, dt, reach) if self.motion is None else None
+
+    def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector:
+        return nodes if self.motion is None else nodes + self.motion.place(nodes, t) - self.motion.place(nodes, 0.0)
+
+    def pivot(self, t: Scalar) -> Float[Array, "d"] | None:
+        """The centre of what turns."""
+        motion = self.motion
+        return None if motion is None or not motion.turns else motion.pivot(jnp.zeros(motion.dim), t)
 
 
 class PlaneContact(AbstractContact):

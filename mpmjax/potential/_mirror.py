@@ -81,9 +81,11 @@ class Image(AbstractImage):
     source: Int[Array, "m"]  # the node of which each node along the axis is a copy, shape (m,)
     even: Int[Array, "m"]  # the sign of copies of even fields, 0 where the source is outside of the window, shape (m,)
     odd: Int[Array, "m"]  # the sign of copies of odd fields, 0 on the plane too, shape (m,)
-    velocity: Scalar | None = None
-    """Velocity V of a mirror that moves along its normal [m/s]; None at rest. The normal velocity of a node beyond it
-    is 2V minus that of its image, and V on it."""
+    velocity: Array | None = None
+    """Velocity V of a mirror that moves along its normal [m/s], or at the nodes of one that holds all components, shape
+    (n, d); None at rest. An odd component of a node beyond it is 2V minus that of its image, and V on it."""
+    holds_all: bool = eqx.field(static=True, default=False)
+    """Whether all components of a vector are odd; else the normal one."""
 
     @property
     def size(self) -> int:
@@ -102,22 +104,22 @@ class Image(AbstractImage):
         return self._copy(blocks, self.even[:, None])
 
     def vector(self, field: NodeVector) -> NodeVector:
-        """B for a vector field: tangential components even, the normal one odd. Of a mirror that moves B v + ℓ, where ℓ
-        is the normal component that the field has on the mirror and beyond."""
-        normal = jnp.arange(field.shape[1]) == self.axis
-        signs = jnp.where(normal, self.odd[:, None], self.even[:, None])
+        """B for a vector field: tangential components even, the normal one odd, or all of them. Of a mirror that moves
+        B v + ℓ, where ℓ has the odd components that the field has on the mirror and beyond."""
+        odd = (jnp.arange(field.shape[1]) == self.axis) | self.holds_all
+        signs = jnp.where(odd, self.odd[:, None], self.even[:, None])
         copied = self._copy(field.reshape(self.layers, *self.shape, -1), signs).reshape(field.shape)
         if self.velocity is None:
             return copied
-        return copied + jnp.where(self.normal(self.odd <= 0, field.shape[1]), field, 0)
+        return copied + jnp.where(self.held(self.odd <= 0, field.shape[1]), field, 0)
 
     def fold(self, field: NodeVector) -> NodeVector:
         at_rest = replace(self, velocity=None)  # what it adds is no part of the linear map
         return transposed(at_rest.vector, field)
 
-    def normal(self, along: Bool[Array, "m"], dim: int) -> Mask:
-        """The normal component of some nodes along the axis, as a mask of shape (n, d)."""
-        return self.along(along)[:, None] & (jnp.arange(dim) == self.axis)
+    def held(self, along: Bool[Array, "m"], dim: int) -> Mask:
+        """The odd components of some nodes along the axis, as a mask of shape (n, d)."""
+        return self.along(along)[:, None] & ((jnp.arange(dim) == self.axis) | self.holds_all)
 
     def along(self, values: Array) -> Array:
         """Values along the axis, shape (m,), at all nodes, shape (n,)."""
@@ -199,7 +201,7 @@ class Mirror(eqx.Module):
         return field
 
     @property
-    def moving(self) -> tuple[tuple[Image, Scalar], ...]:
+    def moving(self) -> tuple[tuple[Image, Array], ...]:
         """The mirrors that move, with their velocities [m/s]."""
         planes = (image for image in self.images if isinstance(image, Image))
         return tuple((image, image.velocity) for image in planes if image.velocity is not None)
@@ -208,13 +210,13 @@ class Mirror(eqx.Module):
         """The part of a velocity that mirrors which move add to it, on them and beyond; zero elsewhere."""
         total = jnp.zeros_like(field)
         for image, _ in self.moving:
-            total = jnp.where(image.normal(image.odd <= 0, field.shape[1]), field, total)
+            total = jnp.where(image.held(image.odd <= 0, field.shape[1]), field, total)
         return total
 
     def with_motion(self, velocity: NodeVector) -> NodeVector:
-        """A velocity [m/s], shape (n, d), with 2V in its normal components beyond mirrors that move."""
+        """A velocity [m/s], shape (n, d), with 2V in its odd components beyond mirrors that move."""
         for image, V in reversed(self.moving):  # where several reach, the first one holds
-            beyond = image.normal((image.odd < 0) | (image.even == 0), velocity.shape[1])
+            beyond = image.held((image.odd < 0) | (image.even == 0), velocity.shape[1])
             velocity = jnp.where(beyond, 2 * V, velocity)
         return velocity
 

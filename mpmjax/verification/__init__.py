@@ -16,6 +16,7 @@ from mpmjax.verification._exact_problem import (
 )
 from mpmjax.verification._motions import (
     AxisAligned as AxisAligned,
+    BentBar as BentBar,
     ExpandingRing as ExpandingRing,
     StandingWave as StandingWave,
     TwoDisks as TwoDisks,

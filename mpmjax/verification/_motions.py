@@ -1,4 +1,4 @@
-"""Problems whose motion is known: of boxes, bars, rings, vortices and waves; and the collision of two disks."""
+"""Problems whose motion is known: of boxes, bars, rings, vortices and waves; a bent bar; the collision of two disks."""
 
 import math
 from typing import Any, ClassVar
@@ -11,9 +11,11 @@ from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.boundary import AbstractBoundary, Conditions, SlipBox, SymmetryPlane
 from mpmjax.checks import require
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import Annulus, Ball, Box
+from mpmjax.geometry import Annulus, Ball, Box, HalfSpace
+from mpmjax.implicit import ConjugateResidual
 from mpmjax.material import AbstractMaterial, FixedCorotated, NeoHookean
-from mpmjax.state import Particles, Scene, fill
+from mpmjax.state import Couple, Particles, Patch, Scene, TotalLagrangian, attach, fill
+from mpmjax.stepping import SemiImplicit, step
 from mpmjax.verification._exact_problem import AbstractProblem, Ends, box_boundary
 
 _PHASES = {1: (0.0,), 2: (0.0, 1.0), 3: (0.0, 2 / 3, 4 / 3)}  # of π
@@ -257,6 +259,41 @@ class StandingWave(AbstractProblem):
             across = (math.inf,) * (self.dim - 1)
             return (SlipBox((0.0, *(-a for a in across)), (1.0, *across)),)
         return box_boundary(*self.box())
+
+
+class BentBar(eqx.Module):
+    """A bar 0 ≤ X ≤ L of height and depth one, held at X = 0 and bent by a couple at its other end, at rest.
+
+    With ν = 0 and a small curvature κ, u = κ (−X Y, X²/2), with the stress −E κ Y along it: the face that is held is
+    the plane X = 0, without any stress that singles out its corners.
+
+    Args:
+        length: L [m].
+        curvature: κ [1/m], so small that squares do not matter.
+        material: a law with ν = 0.
+    """
+
+    length: float = 2.0
+    curvature: float = 1e-5
+    material: AbstractMaterial = FixedCorotated(1e5, 0.0)
+
+    def errors(self, cells: int, held: AbstractBoundary, **choices: Any) -> tuple[float, float]:
+        """The relative errors of the displacement (RMS) and of the stress along the bar (mean, over the largest), with
+        `cells` grid cells over the height, what holds it, and choices of kernel and gradient."""
+        law: Any = self.material
+        L, stiffness = self.length, self.curvature * law.youngs_modulus
+        grid = Grid((math.ceil(L * cells) + 9, 2 * math.ceil(cells / 2) + 9), 1 / cells, origin=(-4, -4 - cells // 2))
+        bar = fill(Box((0.0, -0.5), (L, 0.5)), grid, density=1.0)
+        end = Patch(HalfSpace((L, 0.0), (-1.0, 0.0)), Box((L - 0.1, -0.5), (L + 0.1, 0.5)))
+        choices = {"boundary": held, "loads": Couple(end, stiffness / 12), "description": TotalLagrangian()} | choices
+        scene = attach(Scene(grid, law, **choices), bar)
+        tight = SemiImplicit(solver=ConjugateResidual(rtol=1e-10, max_steps=20_000))
+        after = step(scene, bar, 0.0, 1e6 * L / law.youngs_modulus**0.5, method=tight)[0]
+        X, Y = bar.x.T
+        exact = self.curvature * jnp.stack([-X * Y, X**2 / 2], axis=1)
+        stress = jax.vmap(law.stress)(after.F)[:, 0, 0]
+        u = jnp.sqrt(((after.x - bar.x - exact) ** 2).sum() / (exact**2).sum())
+        return float(u), float(jnp.abs(stress + stiffness * Y).mean() / (stiffness / 2))
 
 
 class TwoDisks(eqx.Module):

@@ -13,7 +13,7 @@ import pytest
 from helpers import DESCRIPTIONS, GRADIENTS, KERNELS, METHODS, SECOND_ORDER, ids
 
 import mpmjax as mpm
-from mpmjax.verification import AxisAligned, Column, Ends, StandingWave, discretise, errors, orders
+from mpmjax.verification import AxisAligned, BentBar, Column, Ends, StandingWave, discretise, errors, orders
 
 CELLS = (8, 16, 32)
 UPDATES = METHODS | SECOND_ORDER
@@ -272,3 +272,23 @@ def test_what_a_period_costs(method, expected):
         last = mpm.rollout(scene, particles, steps=steps, dt=dt, method=method)
         error = float(jnp.sqrt(((last.x - particles.x)[:, 0] ** 2).mean() * 2)) / problem.amplitude
         assert abs(error / figure - 1) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("held", "least", "most"),
+    [
+        (mpm.ClampPlane(0, 0.0), 1.9, 0.016),
+        pytest.param(
+            mpm.Grip(mpm.Box((-9.0, -9.0), (0.0, 9.0)), mpm.Motion((0.0,), ((0.0, 0.0),))),
+            1.1,
+            0.12,
+            marks=pytest.mark.thorough,
+        ),
+    ],
+    ids=["clamp", "grip"],
+)
+def test_order_of_a_bent_bar_by_what_holds_its_end(held, least, most):
+    """At two and four cells over its height. A grip of whole nodes is of first order, and seven times as far off."""
+    e = np.array([BentBar().errors(n, held)[0] for n in (2, 4)])
+    assert least < orders(e, (2, 4))[0] < least + 0.2
+    assert e[1] < most

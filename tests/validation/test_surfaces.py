@@ -5,8 +5,10 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import zeta
 
 import mpmjax as mpm
+from mpmjax.discretisation import make_stencil
 from mpmjax.verification import ExpandingRing, Vortex, discretise, displacement_error, errors, orders, stress_error
 
 RING = ExpandingRing()
@@ -110,3 +112,36 @@ def test_a_scene_with_cut_cells_conserves_what_others_do():
     scale = float((ball.mass * jnp.linalg.norm(ball.v, axis=1)).sum())
     np.testing.assert_allclose(mpm.momentum(after), mpm.momentum(ball), atol=1e-13 * scale)
     assert 0.9 * before < mpm.energy(scene, after).total < before * (1 + 1e-3)
+
+
+@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("number", [2, 4])
+def test_particles_that_moved_apart_leave_a_uniform_stress_a_force_whatever_the_spacing(order, number):
+    """Σ_p l w′(x_p − x_i) of a lattice x_p of spacing l = 1.25 dx/number from s on is by Poisson's formula
+    −Σ_k 2 ω ŵ(ω) sin(ω (s − x_i)), ω = 2πk/l, ŵ(ω) = dx (sin(ω dx/2)/(ω dx/2))^(order + 1)."""
+    for dx in (1.0, 0.1):
+        grid, side, start = mpm.Grid((41,), dx), 1.25 * dx / number, 8 * dx
+        x = jnp.arange(start, 32 * dx, side)[:, None]
+        stencil = make_stencil(mpm.BSpline(order), mpm.SplineGradient(), grid, jnp.asarray(grid.origin), x)
+        left = np.zeros(41)
+        np.add.at(left, np.asarray(stencil.index), side * np.asarray(stencil.gradient)[:, 0])
+        k, nodes = np.arange(1, 5000)[:, None], dx * np.arange(14, 26)
+        omega, transform = 2 * np.pi * k / side, dx * np.sinc(k * dx / side) ** (order + 1)
+        exact = -2 * (omega * transform * np.sin(omega * (start - nodes))).sum(axis=0)
+        np.testing.assert_allclose(left[14:26], exact, atol=1e-3 * np.abs(exact).max())
+        bound = 4 / np.pi**order * zeta(order) * (side / dx) ** order
+        assert bound / 20 < np.abs(exact).max() < bound
+
+
+@pytest.mark.thorough
+def test_a_ring_in_motion_is_of_second_order_with_the_cubic_spline_and_four_particles_a_side():
+    """Of displacement and of stress, where two a side and the quadratic kernel have none (docs/accuracy.md)."""
+    choices = {"kernel": mpm.BSpline(3), "gradient": SPLINE, "per_side": 4, "courant": 0.3}
+    stress = []
+
+    def measure(problem, particles, run):
+        stress.append(float(stress_error(problem, particles, run).max()))
+        return displacement_error(problem, particles, run)
+
+    assert orders(errors(RING, CELLS, measure=measure, **choices), CELLS)[0] > 1.9
+    assert orders(np.array(stress), CELLS)[0] > 1.9
