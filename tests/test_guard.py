@@ -30,8 +30,8 @@ def test_every_transformation_raises_what_is_at_fault_and_changes_nothing_else(t
 
 @pytest.mark.parametrize("jit", [jax.jit, eqx.filter_jit])
 def test_what_a_compiled_program_says_ends_with_the_fault(jit):
-    """After JAX's trace of the callback, and not with advice on another kind of jit."""
-    with pytest.raises(RuntimeError, match=r"x is large$"):
+    """After JAX's trace of the callback; no advice on another kind of jit follows."""
+    with pytest.raises(RuntimeError, match=r"\nRuntimeError: x is large(\n-+\nFor simplicity, JAX[^\n]*)?$"):
         jit(guarded)(jnp.asarray(1.5)).block_until_ready()
 
 
