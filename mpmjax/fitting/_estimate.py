@@ -1,5 +1,6 @@
 """Estimates of numbers and of noise, and the shapes that residuals show where a model misses the data."""
 
+import abc
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -75,6 +76,10 @@ class AbstractFit(eqx.Module):
     def all(self) -> tuple[Estimate, ...]:
         """The fitted numbers, and the reported ones."""
         return self.estimates
+
+    @abc.abstractmethod
+    def __str__(self) -> str:
+        """A table."""
 
     def __getitem__(self, label: str) -> Estimate:
         """The estimate of a parameter, or of a reported number; a KeyError if there is none of this name."""

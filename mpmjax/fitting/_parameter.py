@@ -138,10 +138,8 @@ class AbstractParameter(eqx.Module):
     no bound is ever crossed, and a step of one is a large but not an absurd change.
     """
 
-    where: eqx.AbstractVar[Callable[[Experiment], Any] | None]
-    """The leaf, or a tuple of leaves that share the value, of an experiment, as in `equinox.tree_at`."""
-    update: eqx.AbstractVar[Callable[[Experiment, Value], Experiment] | None]
-    """In the place of `where`: the experiment with the value put into it, for what is no single leaf."""
+    where: eqx.AbstractVar[Callable[[Experiment], Any] | None]  # the leaf, or a tuple that share the value
+    update: eqx.AbstractVar[Callable[[Experiment, Value], Experiment] | None]  # in its place: puts the value in
     start: eqx.AbstractVar[Start | None]  # the first guess; None for the value of the first experiment
     prior: eqx.AbstractVar[AbstractPrior | None]  # prior knowledge of it
     unit: eqx.AbstractVar[str]  # the unit that tables show
@@ -160,10 +158,10 @@ class AbstractParameter(eqx.Module):
             require_finite(f"{name}'s start", self.start)
         if self.prior is not None and (distribution := self.prior.distribution()) is not None:
             (lower, upper), mean = self.domain, distribution[0]
-            require(
-                (mean >= lower) & (mean <= upper),
-                f"{name}'s values lie between {lower:g} and {upper:g}, so the mean of its prior must too, got {mean}.",
+            fault = (
+                f"{name}'s values lie between {lower:g} and {upper:g}, so the mean of its prior must too, got {mean}."
             )
+            require((mean >= lower) & (mean <= upper), fault)
 
     @property
     def logarithmic(self) -> bool:
@@ -249,6 +247,7 @@ class Unbounded(_PlainParameter):
     scale: Scalar | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
+        require_fields(self)
         if self.scale is not None:
             require_positive("Unbounded's scale", self.scale)
 
@@ -298,14 +297,17 @@ class Positive(_PlainParameter):
 
 
 class Bounded(_PlainParameter):
-    """A parameter between two bounds, such as Poisson's ratio: lower + (upper − lower)/(1 + e^{−(z0 + z)}). For all but
-    the bounds see `Positive`.
+    """A parameter between two bounds, such as Poisson's ratio: lower + (upper − lower)/(1 + e^{−(z0 + z)}).
+
+    Args:
+        lower, upper: the bounds; all else see `Positive`.
     """
 
     lower: float | int = eqx.field(static=True, default=0.0, converter=as_plain)
     upper: float | int = eqx.field(static=True, default=1.0, converter=as_plain)
 
     def __check_init__(self):
+        require_fields(self)
         require(self.lower < self.upper, f"Bounded's bounds must grow, got {self.lower} and {self.upper}.")
 
     @property

@@ -92,7 +92,7 @@ class Markers(eqx.Module):
 class Extent(eqx.Module):
     """How far the particles reach: a front, or a height [m]; its derivative is that of the farthest particle."""
 
-    axis: int = eqx.field(static=True)
+    axis: int = eqx.field(static=True)  # the direction
     side: Literal["upper", "lower"] = eqx.field(static=True, default="upper")
     """"upper" for the largest coordinate, "lower" for the smallest."""
 
