@@ -59,8 +59,7 @@ class Gaussian(AbstractPrior):
     """Prior knowledge of a parameter: a normal distribution. It acts like one more measured point a number.
 
     Args:
-        mean: expected value, in the parameter's unit, one number or one for each entry.
-        sigma: standard deviation, likewise.
+        mean, sigma: expected value and standard deviation, in the parameter's unit, one number or one for each entry.
     """
 
     mean: Float[np.ndarray, "..."] = eqx.field(converter=as_floats)
@@ -213,10 +212,9 @@ class AbstractParameter(eqx.Module):
         """The experiment with this value."""
         if self.update is not None:
             return self.update(experiment, value)
-        leaves = leaves_of(self.where, experiment)
-        shapes = {jnp.shape(leaf) for leaf in leaves}
-        require(shapes == {value.shape}, f"it has shape {sorted(shapes)}, and its start {value.shape}.")
-        return eqx.tree_at(partial(leaves_of, self.where), experiment, (value,) * len(leaves))
+        shapes = [jnp.shape(leaf) for leaf in leaves_of(self.where, experiment)]
+        require({*shapes} == {value.shape}, f"it has shape {sorted({*shapes})}, and its start {value.shape}.")
+        return eqx.tree_at(partial(leaves_of, self.where), experiment, (value,) * len(shapes))
 
 
 def leaves_of(where: Callable[[Experiment], Any] | None, experiment: Experiment) -> tuple[Any, ...]:
