@@ -963,4 +963,4 @@ def test_no_steps_is_the_row_of_a_start(tmp_path):
     with FrameWriter.create(tmp_path / "run.h5", problem(run), start=3) as writer:
         step, state, statistics = writer.last()
     assert step == 3
-    assert_same((state, statistics), (initial_state(run.scene, run.final), no_steps(jnp.float64)))
+    assert_same((state, statistics), (initial_state(problem(run)), no_steps(jnp.float64)))

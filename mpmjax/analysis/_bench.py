@@ -154,14 +154,14 @@ class Bench(NamedTuple):
         begun, dtype = time.perf_counter(), self.particles.x.dtype
         scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)
         problem = Problem(scene, self.particles, dt, method)
-        state, states, statistics = initial_state(scene, self.particles), [], no_steps(dtype)
+        state, states, statistics = initial_state(problem), [], no_steps(dtype)
         for k in range(frames):
             state, new, before = segment(problem, state, k * each, each, max_steps=_MOST_STEPS)
             statistics = statistics.merged(new)
             if not bool(jax.block_until_ready(statistics.healthy)):
                 if throw:
                     run = run_to(problem, state, statistics.steps, statistics)
-                    raise_faults(run, self.particles, before, 0)
+                    raise_faults(run, problem, before, 0)
                 return Timed(None, 0.0, time.perf_counter() - begun)
             states.append(state.particles)
         return Timed(states, float(statistics.linearisation_error), time.perf_counter() - begun)

@@ -338,7 +338,6 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
     say("longest step", ", ".join(f"{name} {dt:.3g} s" for name, dt in bounds.items() if np.isfinite(dt)))
     say("without bound", ", ".join(name for name, dt in bounds.items() if np.isinf(dt)))
     method, dt = run.method, stable_step(path, file) if run.dt == "stable" else run.dt
-    state = initial_state(scene, particles)
     if method is not None and dt is not None:
         dt = float(dt)
         of_explicit, bound = dt / bounds[name_of(Explicit())], float(stable_dt(scene, particles, method=method))
@@ -365,9 +364,10 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
     else:
         say("steps", f"are chosen by pilot runs: mpmjax chart {path} shows them")
     if plot is not None:
-        frames = jax.tree.map(lambda a: a[None], state.particles)
         zero = jnp.zeros(1, particles.x.dtype)
         problem = Problem(scene, particles, zero[0], Explicit())
+        state = initial_state(problem)
+        frames = jax.tree.map(lambda a: a[None], state.particles)
         shown = run_to(problem, state, 0, no_steps(particles.x.dtype), steps=zero, frames=frames)
         render(shown, plot, colour=None)
         say("written", str(plot))

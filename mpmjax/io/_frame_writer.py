@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -77,8 +78,9 @@ class FrameWriter:
         path = Path(path)
         check_place(path, overwrite=overwrite)
         with undisturbed():
-            with new_writer(path, run, fields) as writer:
-                writer.append(start, initial_state(run.scene, run.particles), no_steps(run.particles.x.dtype))
+            begin = initial_state(run)
+            with new_writer(path, run, begin, fields) as writer:
+                writer.append(start, begin, no_steps(run.particles.x.dtype))
             return cls.resume(path, run)
 
     @classmethod
@@ -93,7 +95,7 @@ class FrameWriter:
                 for i in range(count_in(file)):
                     frame_rows(file, i, i + 1)
                 fields = [name for name in FIELDS if f"VTKHDF/PointData/{name}" in file]
-                described, rows = _first(run, fields)
+                described, rows = _first(run, initial_state(run), fields)
                 check_same(path, described, description_in(file["mpmjax"]))
                 require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
             file = opened(staged, path)
@@ -135,7 +137,7 @@ class FrameWriter:
 
     def last(self) -> tuple[int, RolloutState, RunStatistics]:
         """Step number, state and statistics of the last frame."""
-        n, like = count_in(self._file), jax.eval_shape(lambda: initial_state(self._run.scene, self._run.particles))
+        n, like = count_in(self._file), jax.eval_shape(lambda: initial_state(self._run))
         steps, states, tallies = frames_in(self._file, like, n - 1, n)
         return int(steps[0]), *at((states, tallies), 0)
 
@@ -176,9 +178,10 @@ class FrameWriter:
 
 
 @contextmanager
-def new_writer(path: Path, run: Problem, fields: Sequence[str]) -> Iterator[FrameWriter]:
-    """A writer of a new file, without frames, which is at `path` when the block has ended without an error."""
-    described, rows = _first(run, fields)
+def new_writer(path: Path, run: Problem, begin: RolloutState, fields: Sequence[str]) -> Iterator[FrameWriter]:
+    """A writer of a new file, without frames, which will be of states as that at the beginning. It is at `path` when
+    the block has ended without an error."""
+    described, rows = _first(run, begin, fields)
     with replacing(path) as aside, StagedFile(aside) as staged:
         file = created(staged, path, described, rows)
         file.flush()
@@ -193,10 +196,16 @@ def at(tree: Any, index: int | slice) -> Any:
     return jax.tree.map(lambda a: jax.device_put(np.asarray(a)[index]), tree)
 
 
-def _first(run: Problem, fields: Sequence[str]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """A run's description, and the rows of a frame of its state at the start."""
-    begin, unstepped = initial_state(run.scene, run.particles), no_steps(run.particles.x.dtype)
-    return describe(run), _rows(run, fields, 0, 0, begin, unstepped)
+def _first(run: Problem, begin: RolloutState, fields: Sequence[str]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """A run's description, and the rows of a frame of its state at the beginning. Of a control, which may be any
+    function, the description has the name and a checksum of its numbers."""
+    control = None if begin.particles.mass is None else "unknown"
+    if run.control is not None:
+        numbers = jax.tree.leaves(eqx.filter(run.control, eqx.is_array))
+        name = getattr(run.control, "__qualname__", type(run.control).__qualname__)
+        control = f"{name} {checksum({str(i): np.asarray(a) for i, a in enumerate(numbers)}):08x}"
+    rows = _rows(run, fields, 0, 0, begin, no_steps(run.particles.x.dtype))
+    return describe(run) | {"control": control}, rows
 
 
 def _rows(
@@ -213,6 +222,7 @@ def _rows(
     for name in _IMPULSES:
         if (both := getattr(state, name)) is not None:
             rows[f"mpmjax/{name}"] = np.concatenate([np.asarray(both.impulse), np.asarray(both.angular)], axis=1)[None]
+    rows |= {f"mpmjax/memory/{i}": np.asarray(a)[None] for i, a in enumerate(jax.tree.leaves(state.memory))}
     return rows | {"mpmjax/checksums": np.array([checksum(rows)], np.uint32)}
 
 
@@ -227,4 +237,6 @@ def frames_in(file: File, like: RolloutState, start: int, stop: int) -> tuple[np
         if getattr(like, name) is not None:
             both = np.split(rows[f"mpmjax/{name}"], [like.particles.x.shape[1]], axis=-1)
             received[name] = Impulses(*jax.device_put(both))
+    kept, memory = jax.tree.flatten(like.memory)[0], jax.tree.structure(like.memory)
+    received["memory"] = memory.unflatten(jax.device_put(rows[f"mpmjax/memory/{i}"]) for i in range(len(kept)))
     return table["step"], RolloutState(states_in(rows, like.particles), **received), tallies

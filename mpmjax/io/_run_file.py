@@ -40,6 +40,7 @@ _GROWING = (
     "mpmjax/frames",
     "mpmjax/collider_impulse",
     "mpmjax/boundary_impulse",
+    "mpmjax/memory/",
     "mpmjax/checksums",
 )
 # levels above 1 take up to 30 times as long for 3 to 5 % less: 55 and 63 % are saved of a jelly's and of a heap's run
@@ -264,6 +265,8 @@ def created(staged: StagedFile, path: Path, described: dict[str, Any], rows: dic
         group.attrs.create(name, np.bytes_(text.encode()))  # of fixed length: others lie where HDF5 has no checksum
     group.attrs["format"] = np.int64(FORMAT)
     group.attrs["d"] = np.int64(described["d"])
+    if described["control"] is not None:
+        group.attrs.create("control", np.bytes_(described["control"].encode()))
     if described["counts"] is not None:
         group.attrs["counts"] = np.asarray(described["counts"], np.int64)
     group.attrs["dt"] = described["dt"]
@@ -294,6 +297,8 @@ def rows_of(frame: int, time: float, state: State, fields: Mapping[str, Any]) ->
     data = {"velocity": np.pad(v, flat), "J": J, "deformation_gradient": _padded(F, 1.0)}
     if state.C is not None:
         data["affine_velocity"] = _padded(np.asarray(state.C), 0.0)
+    if state.mass is not None:
+        data |= {"mass": np.asarray(state.mass), "volume": np.asarray(state.volume)}
     for name, rows, leaf in history_arrays(state):
         data.setdefault(name, np.full(p, np.nan, x.dtype))[rows] = leaf
     for name, field in fields.items():
@@ -323,6 +328,7 @@ def states_in(rows: dict[str, np.ndarray], like: State) -> State:
         return taken(f"VTKHDF/PointData/{name}", 3, 3)
 
     F, J = tensors("deformation_gradient"), taken("VTKHDF/PointData/J")
+    masses = [None if like.mass is None else taken(f"VTKHDF/PointData/{name}") for name in ("mass", "volume")]
     history = [
         rows[f"VTKHDF/PointData/{name}"].reshape(-1, p)[:, of] for name, of, _ in history_arrays(like)
     ]  # kept, since laws may share a name
@@ -332,6 +338,7 @@ def states_in(rows: dict[str, np.ndarray], like: State) -> State:
         None if like.C is None else tensors("affine_velocity")[..., :d, :d],
         tuple((J if a.ndim == 1 else F[..., : a.shape[1], : a.shape[1]])[:, of] for of, a, _ in by_material(like)),
         jax.tree.unflatten(jax.tree.structure(like.histories), history),
+        *masses,
     )
     return State(*jax.device_put(parts))
 
@@ -369,6 +376,7 @@ def description_in(group: File) -> dict[str, Any]:
         "d": int(group.attrs["d"]),
         "counts": tuple(group.attrs["counts"].tolist()) if "counts" in group.attrs else None,
         "dt": group.attrs["dt"],
+        "control": group.attrs["control"].decode() if "control" in group.attrs else None,
         **{name: json.loads(group[name][...].tobytes()) for name in ("scene", "method")},
         "arrays": {name: dataset[...] for name, dataset in group["arrays"].items()},
         "particles": {name: group[name][...] if name in group else None for name in _UNCHANGING},

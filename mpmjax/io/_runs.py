@@ -5,7 +5,8 @@
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
                 `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
                 up to it; `collider_impulse` and `boundary_impulse`, those on each by then, linear, then angular;
-                `checksums`, CRC-32 of all that a frame adds, and the attribute `checksum`, that of all other datasets
+                the `memory` of a control; `checksums`, CRC-32 of all that a frame adds, and the attribute `checksum`,
+                that of all other datasets
 
 Whatever is not in a dataset lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps` is raised
 last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that the disk
@@ -18,6 +19,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -43,6 +45,7 @@ from mpmjax.io._run_file import (
 from mpmjax.io._schema import decode
 from mpmjax.io._transactional_file import reporting
 from mpmjax.simulation import (
+    Control,
     Fault,
     Problem,
     RolloutState,
@@ -56,7 +59,7 @@ from mpmjax.simulation import (
     segment,
     warn_of_inaccuracy,
 )
-from mpmjax.state import Particles, Scene, prepare, state_of
+from mpmjax.state import Particles, Scene, State, prepare, state_of
 from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
 
 _merged = eqx.filter_jit(RunStatistics.merged)
@@ -77,6 +80,8 @@ def record(
     overwrite: bool = False,
     resume: bool = False,
     progress: bool = False,
+    control: Control | None = None,
+    memory: Any = None,
 ) -> Run:
     """Simulate as `simulate` does, writing each frame to a file when it is reached; memory holds one frame only.
 
@@ -96,6 +101,8 @@ def record(
         overwrite: replace a file that is there.
         resume: continue from the last frame in the file up to t1. Where that is reached already, nothing is done.
         progress: show a progress bar on standard error.
+        control, memory: as in `simulate`. Each frame has the memory; a run is resumed with the control and memory that
+            it began with, of which the file knows the name and a checksum of the arrays that an `equinox.Module` has.
 
     Returns:
         the run without its frames, which are in the file.
@@ -112,8 +119,8 @@ def record(
     dt = step_for(scene, particles, t1, dt, method, start)
     end = start + number_of_steps(t1, dt, start, particles.x.dtype)
     save_every = min(require_whole("save_every", save_every, 1), end - start)
-    scene, dt_, method = canonical((scene, dt, method), particles.x.dtype)
-    problem = Problem(scene, particles, dt_, method)
+    scene, dt_, method, *kept = canonical((scene, dt, method, control, memory), particles.x.dtype)
+    problem = Problem(scene, particles, dt_, method, **dict(zip(("control", "memory"), kept, strict=True)))
     if resume:
         writer = FrameWriter.resume(path, problem)
     else:
@@ -140,7 +147,7 @@ def record(
 
         with bar, reporting(stopped):
             healthy = True
-            before: Callable[[], RolloutState] = partial(initial_state, scene, particles)
+            before: Callable[[], RolloutState] = partial(initial_state, problem)
             while healthy and step < end:
                 count = min(save_every - (step - start) % save_every, end - step)
                 state, new, before = segment(problem, state, step, count, max_steps=save_every)
@@ -155,10 +162,11 @@ def record(
                     bar.update(count)
         run = run_to(problem, state, step, statistics)
         try:
-            raise_faults(run, particles, before, start)
+            raise_faults(run, problem, before, start)
         except SimulationError as error:
             good = error.run
-            last = RolloutState(state_of(good.final), good.final_collider_impulse, good.final_boundary_impulse)
+            received = good.final_collider_impulse, good.final_boundary_impulse, good.final_memory
+            last = RolloutState(_end_of(good, state.particles), *received)
             try:
                 append(int(good.final_step), last, statistics)
                 resumable = int(statistics.fault) == Fault.NONE
@@ -192,15 +200,21 @@ def save(path: str | os.PathLike, run: Run, *, fields: tuple[str, ...] | list[st
     final_step = int(run.final_step)
     count = int((np.asarray(run.steps) < final_step).sum())  # beyond it lie frames of a run that met a fault
     steps, frames = at((run.steps, run.frames), slice(count))
-    states = (state_of(run.final),) if frames is None else (frames, state_of(run.final))
+    last = RolloutState(_end_of(run, frames), run.final_collider_impulse, run.final_boundary_impulse, run.final_memory)
+    states = (last.particles,) if frames is None else (frames, last.particles)
     check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
     unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.statistics)
-    with new_writer(path, Problem(run.scene, run.final, run.dt, run.method), fields) as writer:
+    with new_writer(path, Problem(run.scene, run.final, run.dt, run.method), last, fields) as writer:
         for i in range(count):
-            frame = at((frames, run.collider_impulse, run.boundary_impulse), i)
+            frame = at((frames, run.collider_impulse, run.boundary_impulse, run.memory), i)
             writer.append(int(steps[i]), RolloutState(*frame), unknown)
-        received = run.final_collider_impulse, run.final_boundary_impulse
-        writer.append(final_step, RolloutState(state_of(run.final), *received), run.statistics)
+        writer.append(final_step, last, run.statistics)
+
+
+def _end_of(run: Run, like: State | None) -> State:
+    """The state at the end, with masses if a state `like` it has them."""
+    masses = {} if like is None or like.mass is None else {"mass": run.final.mass, "volume": run.final.volume}
+    return replace(state_of(run.final), **masses)
 
 
 @checked
@@ -239,12 +253,22 @@ def load(path: str | os.PathLike, *, frame: int | None = None) -> Run:
         parts: dict[str, Any] = jax.device_put(described["particles"])
         blank = jax.device_put(np.zeros((len(parts["mass"]), scene.grid.dim), dtype))
         particles = Particles(blank, blank, **parts, counts=described["counts"])
-        like = jax.eval_shape(lambda: initial_state(scene, prepare(scene, particles)))
+        problem = Problem(scene, particles, canonical(described["dt"], dtype), method)
+        remembered = (0.0,) * len(file["mpmjax"].get("memory", ()))
+
+        def begin() -> RolloutState:
+            state = initial_state(replace(problem, particles=prepare(scene, particles)))
+            if described["control"] is None:
+                return state
+            whole = replace(state.particles, mass=particles.mass, volume=particles.volume)
+            return replace(state, particles=whole, memory=remembered)
+
+        like = jax.eval_shape(begin)
         steps, frames, tallies = frames_in(file, like, start, stop)
         check_numbers(scene, described["dt"], steps, frames.particles)
     last, statistics = at((frames, tallies), -1)
     return run_to(
-        Problem(scene, particles, canonical(described["dt"], dtype), method),
+        problem,
         last,
         steps[-1],
         statistics,
@@ -252,6 +276,7 @@ def load(path: str | os.PathLike, *, frame: int | None = None) -> Run:
         frames=frames.particles,
         collider_impulse=frames.collider_impulse,
         boundary_impulse=frames.boundary_impulse,
+        memory=frames.memory,
     )
 
 
@@ -273,6 +298,8 @@ def table(run: Run | str | os.PathLike) -> dict[str, np.ndarray]:
             statistics = {name: rows[name] for name in rows.dtype.names if name != "step"}
     require(len(run) > 0, "The run has no frames to tabulate: pass save_every to simulate.")
     columns = {"step": np.asarray(run.steps), "time [s]": np.asarray(run.times)}
+    if run.frames is not None and run.frames.mass is not None:
+        columns["mass [kg]"] = np.asarray(run.frames.mass).sum(axis=1)
     energies = [energy(run.scene, run.frame(i)) for i in range(len(run))]
     for name in ("kinetic", "elastic", "potential", "total"):
         columns[f"{name} energy [J]"] = np.array([float(getattr(e, name)) for e in energies])

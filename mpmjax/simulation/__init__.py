@@ -1,6 +1,7 @@
 """Rollouts: many steps, driven by diffrax, and their faults in words."""
 
 from mpmjax.simulation._diffrax import (
+    Control as Control,
     Problem as Problem,
     RolloutState as RolloutState,
     initial_state as initial_state,

@@ -16,10 +16,11 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Int, Scalar, components, particle_first
 from mpmjax.autodiff import materialised, rematerialised
 from mpmjax.boundary import Impulses, no_impulses
+from mpmjax.checks import canonical, require, shortened
 from mpmjax.discretisation import Stencil, in_window
 from mpmjax.simulation._run import Fault, RunStatistics, no_steps, one_step
 from mpmjax.simulation._sorting import MemoryOrder, resorted
-from mpmjax.state import Particles, Scene, State, state_of, with_state
+from mpmjax.state import Particles, Scene, State, state_of, with_dust, with_state
 from mpmjax.stepping import AbstractIntegrator, StepInfo, step_compiled
 
 LEAST_STRETCH = 1e-2  # principal stretch [-] below which a particle has collapsed
@@ -33,6 +34,8 @@ class RolloutState(eqx.Module):
     """Linear and angular impulse on the scene's colliders since the rollout began; None without colliders."""
     boundary_impulse: Impulses | None = None
     """Linear and angular impulse on the scene's boundaries; None unless the scene has `boundary_forces`."""
+    memory: Any = None
+    """The memory of the run's control."""
     order: MemoryOrder | None = None
     """The order of the particles in memory; None if it is that in which they were given."""
 
@@ -54,7 +57,8 @@ class RolloutState(eqx.Module):
 
     def after(self, particles: Particles, info: StepInfo) -> "RolloutState":
         """The state after a step, from the particles after it and what it reports."""
-        new = replace(self, particles=state_of(particles))
+        before = self.particles
+        new = replace(self, particles=replace(state_of(particles), mass=before.mass, volume=before.volume))
         if self.collider_impulse is not None and info.colliders is not None:
             new = replace(new, collider_impulse=self.collider_impulse.plus(info.colliders))
         if self.boundary_impulse is not None and info.boundaries is not None:
@@ -62,17 +66,30 @@ class RolloutState(eqx.Module):
         return new
 
 
-def initial_state(scene: Scene, particles: Particles) -> RolloutState:
-    """The state in which a rollout of prepared particles begins."""
+def initial_state(problem: "Problem") -> RolloutState:
+    """The state in which a rollout begins."""
+    scene, particles = problem.scene, problem.particles
+    require(
+        all(map(eqx.is_inexact_array, jax.tree.leaves(problem.memory))),
+        "A control's memory must be a pytree of floats: store a switch or a count as one, and derive keys of random "
+        "numbers from the time.",
+    )
     of = particles.dim, particles.x.dtype
     colliders = no_impulses(scene.collider_count, *of) if scene.collider_count else None
     boundaries = no_impulses(len(scene.boundary) + len(scene.guides), *of) if scene.boundary_forces else None
-    return RolloutState(state_of(particles), colliders, boundaries)
+    state = state_of(particles)
+    if problem.control is not None:
+        state = replace(state, mass=particles.mass, volume=particles.volume)
+    return RolloutState(state, colliders, boundaries, problem.memory)
 
 
 def _with_transposed_affine(state: State) -> State:
     """A component-first state with C transposed."""
     return state if state.C is None else eqx.tree_at(lambda s: s.C, state, jnp.swapaxes(state.C, 0, 1))
+
+
+Control = Callable[[Scene, Particles, Scalar, Scalar, Any], tuple[Scene, Particles, Any]]
+"""A function of scene, particles, time [s], step [s] and memory that returns scene, particles and memory."""
 
 
 class Problem(eqx.Module):
@@ -84,6 +101,8 @@ class Problem(eqx.Module):
     method: AbstractIntegrator  # the integrator
     stencil: Stencil | None = None  # in the total description, where it is made once
     observe: Callable[[Scene, Particles], Any] | None = None  # what is saved of each frame besides its state
+    control: Control | None = None  # what acts before each step
+    memory: Any = None  # the control's memory before the first step
     start: Scalar = 0.0  # number of the first step
     until: Scalar = np.inf  # number of steps after which a watched run ends, if it is less than were asked for
     slot: Scalar = 0.0  # zero; adjoint solves report through its cotangent (see `Reporting`)
@@ -96,6 +115,27 @@ class Problem(eqx.Module):
     def at(self, state: State) -> Particles:
         """The particles with a state put in."""
         return with_state(self.particles, state)
+
+    def controlled(self, y: RolloutState, step: Scalar) -> "tuple[Problem, RolloutState]":
+        """The problem and the state y as the control has them in the step after so many of the run."""
+        if self.control is None:
+            return self, y
+        before = self.scene, self.at(y.particles), y.memory
+        after = self.control(*before[:2], (self.start + step) * self.dt, self.dt, y.memory)
+        after = canonical(after, y.particles.x.dtype)
+        alike = isinstance(after, tuple) and eqx.tree_equal(*(jax.tree.map(jnp.shape, a[1:]) for a in (before, after)))
+        require(
+            alike and isinstance(after[0], Scene),
+            "A control must return (scene, particles, memory), particles and memory of the structure and shapes that "
+            f"it was given, here {shortened(str(jax.tree.map(jnp.shape, y.memory)))} of the memory.",
+        )
+        scene, particles, memory = after
+        state = replace(state_of(particles), mass=particles.mass, volume=particles.volume)
+        return replace(self, scene=scene), replace(y, particles=state, memory=memory)
+
+    def in_step(self, state: State) -> Particles:
+        """The particles as a step takes them."""
+        return self.at(state) if self.control is None else with_dust(self.at(state))
 
     def resorted(self, y: RolloutState, step: Array) -> "tuple[Problem, RolloutState]":
         """The problem and the state y before a step, `step` of them since the rollout began, their particles in the
@@ -182,9 +222,10 @@ class StepSolver(diffrax.AbstractSolver):
         statistics, report = solver_state
         step = jnp.round(t0)  # diffrax divides an interval evenly, which is exact only up to rounding
         args, y = args.resorted(y0, step)
+        args, y = args.controlled(y, step)
         t = (args.start + step) * args.dt
         method = args.method.reporting(args.slot)
-        particles, info = step_compiled(args.scene, args.at(y.particles), t, args.dt, method, args.stencil)
+        particles, info = step_compiled(args.scene, args.in_step(y.particles), t, args.dt, method, args.stencil)
         report = report + info.solve.report
         y1 = y.after(particles, info)
         arrays, rest = eqx.partition((args, y.particles, y1.particles, t), eqx.is_array)

@@ -20,19 +20,20 @@ from mpmjax.state import Particles, Scene, state_of, warn_of_crowding, with_stat
 from mpmjax.stepping import SAFETY, AbstractIntegrator, UnknownBoundError, longest_step
 
 
-def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState], start: int) -> None:
-    """Raise the faults in the statistics of an untraced run, which began with these particles at step `start`; `before`
-    gives the state before the last step."""
+def raise_faults(run: Run, problem: Problem, before: Callable[[], RolloutState], start: int) -> None:
+    """Raise the faults in the statistics of an untraced run of a problem that began at step `start`; `before` gives the
+    state before the last step."""
     fault = Fault(int(run.statistics.fault))
     if fault != Fault.NONE:
         previous = before()
         step = start + int(run.statistics.fault_step)
-        problem = Problem(run.scene, run.final, run.dt, run.method)
-        bad = faulty_particles(problem, state_of(run.final), step * run.dt)
+        ends = replace(problem, particles=run.final, start=jnp.asarray(0, run.final.x.dtype))
+        ends, before_step = ends.controlled(previous, jnp.asarray(step - 1, run.final.x.dtype))
+        bad = faulty_particles(ends, state_of(run.final), step * run.dt)
         _, what, advice = _WORDS[fault]
         if fault == Fault.PASSED:
             t = jnp.asarray(step - 1, run.final.x.dtype) * run.dt
-            passed = passed_particles(problem, previous.particles, state_of(run.final), t)
+            passed = passed_particles(ends, before_step.particles, state_of(run.final), t)
             number, bad[fault] = next((i, mask) for i, mask in passed if mask.any())
             what = f"{what} boundary {number}, {type(run.scene.boundary[number]).__name__}"
             if run.scene.total:
@@ -43,7 +44,7 @@ def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState],
             what, advice = disallowed(law, run.method)
         last = with_state(run.final, previous.particles)
         reached = int((run.steps < step).sum())
-        names = ("steps", "frames", "observed", "collider_impulse", "boundary_impulse")
+        names = ("steps", "frames", "observed", "collider_impulse", "boundary_impulse", "memory")
         saved = {name: getattr(run, name) for name in names}
         good = replace(
             run,
@@ -51,11 +52,13 @@ def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState],
             final=last,
             final_collider_impulse=previous.collider_impulse,
             final_boundary_impulse=previous.boundary_impulse,
+            final_memory=previous.memory,
             final_step=jnp.asarray(step - 1, run.final_step.dtype),
         )
         raise SimulationError(
             f"At step {step} (t = {step * float(run.dt):.6g} s) particle {first} {what}; the last good position was "
-            f"{np.asarray(previous.particles.x[first])}. {advise(run.scene, run.method, run.dt, began, last, advice)}"
+            f"{np.asarray(previous.particles.x[first])}. "
+            + advise(run.scene, run.method, run.dt, problem.particles, last, advice)
             + averaging_advice(run.scene),
             good,
         )

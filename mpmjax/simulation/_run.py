@@ -200,6 +200,11 @@ class Run(eqx.Module):
     boundary_impulse: Impulses | None = None
     final_boundary_impulse: Impulses | None = None
 
+    memory: Any = None
+    """The memory of the run's control at each saved frame, with a leading axis f; of a run from a file its arrays."""
+    final_memory: Any = None
+    """The memory of the control at the end, with which another run goes on."""
+
     @property
     def times(self) -> Float[Array, "*f"]:
         """Time of each saved frame [s], shape (f,)."""

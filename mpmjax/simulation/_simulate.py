@@ -27,6 +27,7 @@ from mpmjax.checks import (
     requirements,
 )
 from mpmjax.simulation._diffrax import (
+    Control,
     Problem,
     RolloutState,
     StepSolver,
@@ -38,7 +39,7 @@ from mpmjax.simulation._diffrax import (
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
 from mpmjax.simulation._run import Fault, Run, RunStatistics
 from mpmjax.simulation._sorting import memory_order
-from mpmjax.state import Particles, Scene, prepare, state_of, warn_of_rounding, with_state
+from mpmjax.state import Particles, Scene, prepare, warn_of_rounding, with_state
 from mpmjax.stepping import MOST_STEPS, AbstractIntegrator, Explicit, step_for, step_unchecked
 
 _CHECKPOINT_BYTES = 2**28
@@ -59,6 +60,8 @@ def simulate(
     checkpoint_bytes: int = _CHECKPOINT_BYTES,
     progress: bool = False,
     throw: bool = True,
+    control: Control | None = None,
+    memory: Any = None,
 ) -> Run:
     """Simulate a scene from step `start` to time t1 in steps of dt.
 
@@ -86,6 +89,11 @@ def simulate(
         progress: show diffrax's progress meter.
         throw: raise on faults. With False the result says them in `statistics`, and a batch member that fails leaves
             the others alone.
+        control: a pure function `(scene, particles, t, dt, memory) -> (scene, particles, memory)`, called before each
+            step: the scene that it returns has other numbers in this step (accelerations, motions of boundaries), the
+            particles that it returns go on from there (activations, particles that enter or leave), and so does the
+            memory. Weights that are trained are arrays of an `equinox.Module`. See docs/control.md.
+        memory: the control's memory at the start, a pytree of floats; e.g. a former run's `final_memory`.
 
     Raises:
         ValueError: of `prepare`; a value of the method that it does not allow; a t1 that is not a whole number of steps
@@ -102,7 +110,7 @@ def simulate(
     """
     start = require_whole("start", start, 0)
     dtype = particles.x.dtype
-    scene, method = canonical((scene, method), dtype)
+    scene, method, control, memory = canonical((scene, method, control, memory), dtype)
     requirements(method)
     particles = prepare(scene, particles)
     dt = step_for(scene, particles, t1, dt, method, start)
@@ -111,9 +119,12 @@ def simulate(
         save_every = min(require_whole("save_every", save_every, 1), count)
     if observe is not None and save_every is None:
         save_every = 1
-    begin, first, dt_ = initial_state(scene, particles), *canonical((start, dt), dtype)
+    first, dt_ = canonical((start, dt), dtype)
+    begin = initial_state(Problem(scene, particles, dt_, method, control=control, memory=memory))
     state_bytes = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(begin))
-    traced = is_traced((scene, particles, dt_, method, observe))  # under jax.jit also if all that was passed is known
+    traced = is_traced(
+        (begin, scene, particles, dt_, method, observe, control)
+    )  # under jax.jit also if all that was passed is known
     if save_every is not None and observe is None:
         frames = count // save_every + 2
         require_memory(
@@ -132,10 +143,11 @@ def simulate(
         numbers = 2 * (d + 1) * scene.grid.size + (d + d * d) * particles.count
         step_bytes = state_bytes + numbers * dtype.itemsize
         adjoint = checkpointed(count, state_bytes, step_bytes, checkpoint_bytes, stops=not traced)
-    problem = Problem(scene, particles, dt_, method, observe=observe, start=first, slot=slot, save_every=save_every)
+    held = {"observe": observe, "control": control, "memory": memory, "slot": slot, "save_every": save_every}
+    problem = Problem(scene, particles, dt_, method, start=first, **held)
     go = partial(integrate, problem, begin, max_steps=count, adjoint=adjoint, progress=progress, watch=not traced)
     end = go(until=np.asarray(np.inf, dtype))
-    values, on_colliders, on_boundaries = end.saved
+    values, on_colliders, on_boundaries, memories = end.saved
     run = run_to(
         problem,
         end.state,
@@ -147,13 +159,14 @@ def simulate(
         report=end.report if traced else None,
         collider_impulse=on_colliders,
         boundary_impulse=on_boundaries,
+        memory=memories,
     )
     if not throw:
         return run
     if traced:
         return guarded(run, end.report)
     warn_of_rounding(scene.grid, run.final.x, particles.x)
-    raise_faults(run, particles, lambda: _before_fault(go, begin, end.statistics), start)
+    raise_faults(run, problem, lambda: _before_fault(go, begin, end.statistics), start)
     warn_of_inaccuracy(run)
     return run
 
@@ -167,12 +180,14 @@ def rollout(
     dt: Scalar,
     method: AbstractIntegrator = Explicit(),
     start: Scalar = 0,
+    control: Control | None = None,
+    memory: Any = None,
 ) -> Particles:
     """The plain rollout: `jax.lax.scan` over steps, without saving or checks. Tests compare `simulate` with it. Reverse
     mode stores the state before each step and the solutions of implicit solves, and computes the rest again.
 
     Args:
-        scene, particles, method, start: as in `simulate`.
+        scene, particles, method, start, control, memory: as in `simulate`.
         steps: number of steps.
         dt: step [s].
 
@@ -181,25 +196,28 @@ def rollout(
     """
     require_positive("dt [s]", dt, particles.x.dtype)
     steps, start = require_whole("steps", steps, 0), require_whole("start", start, 0)
-    scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
+    start = jnp.asarray(start, particles.x.dtype)
+    scene, dt, method, control, memory = canonical((scene, dt, method, control, memory), particles.x.dtype)
     requirements(method)
-    return _rollout(scene, prepare(scene, particles), dt, method, steps, jnp.asarray(start, particles.x.dtype))
+    of = {"start": start, "control": control, "memory": memory}
+    return _rollout(Problem(scene, prepare(scene, particles), dt, method, **of), steps)
 
 
 @eqx.filter_jit
-def _rollout(
-    scene: Scene, particles: Particles, dt: Scalar, method: AbstractIntegrator, steps: int, start: Float[Array, ""]
-) -> Particles:
-    problem = Problem(scene, particles, dt, method, scene.stencil(particles) if scene.total else None, start=start)
+def _rollout(problem: Problem, steps: int) -> Particles:
+    scene, particles = problem.scene, problem.particles
+    problem = replace(problem, stencil=scene.stencil(particles) if scene.total else None)
 
     def body(y: RolloutState, n: Array) -> tuple[RolloutState, None]:
         here, y = problem.resorted(y, n)
-        t = (start + n) * dt
-        new, _ = step_unchecked(here.scene, here.at(y.particles), t, dt, method, here.stencil)
-        return replace(y, particles=state_of(new)).to_loop_layout(), None
+        here, y = here.controlled(y, n)
+        t = (here.start + n) * here.dt
+        new, info = step_unchecked(here.scene, here.in_step(y.particles), t, here.dt, here.method, here.stencil)
+        return y.after(new, info).to_loop_layout(), None
 
-    begin = RolloutState(state_of(particles), None, order=memory_order(scene, particles, steps)).to_loop_layout()
-    end, _ = jax.lax.scan(rematerialised(body), begin, jnp.arange(steps, dtype=particles.x.dtype))
+    order = memory_order(scene, particles, steps) if problem.control is None else None
+    begin = replace(initial_state(problem), collider_impulse=None, boundary_impulse=None, order=order)
+    end, _ = jax.lax.scan(rematerialised(body), begin.to_loop_layout(), jnp.arange(steps, dtype=particles.x.dtype))
     return with_state(particles, end.as_given().particles)
 
 
@@ -234,8 +252,8 @@ class End(NamedTuple):
 
     steps: Float[Array, "f"]  # numbers of the saved frames; none if nothing was saved
     saved: Any
-    """The frames, along a first axis: of each its state or what was observed, and the impulses on colliders and on
-    boundaries."""
+    """The frames, along a first axis: of each its state or what was observed, the impulses on colliders and on
+    boundaries, and the control's memory."""
     state: RolloutState
     step: Float[Array, ""]  # the number of the last step
     statistics: RunStatistics
@@ -274,13 +292,15 @@ def integrate(
         valid = jnp.where(unmet > 0, jnp.nan, 1)  # with a bad parameter what follows would look like numbers
         state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
         problem = replace(problem, fault=jnp.where(unmet > 0, Fault.BAD_PARAMETERS, fault), unmet=unmet)
-    state = replace(state, order=memory_order(scene, particles, save_every or max_steps)).to_loop_layout()
+    if problem.control is None:  # a control may know particles by their numbers
+        state = replace(state, order=memory_order(scene, particles, save_every or max_steps))
+    state = state.to_loop_layout()
 
     def frame(t: Any, y: RolloutState, args: Problem) -> Any:
         del t
         y = y.as_given()
         value = y.particles if args.observe is None else args.observe(args.scene, args.at(y.particles))
-        return value, y.collider_impulse, y.boundary_impulse
+        return value, y.collider_impulse, y.boundary_impulse, y.memory
 
     subs = {"final": diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: y.as_given())}
     if save_every is not None:
@@ -301,7 +321,7 @@ def integrate(
     )
     times, values, (statistics, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
-    steps, saved = jnp.zeros((0,), dtype), (None, None, None)
+    steps, saved = jnp.zeros((0,), dtype), (None,) * 4
     if save_every is not None:
         steps, saved = start + jnp.round(times["frames"]), values["frames"]
     return End(steps, saved, final, start + statistics.steps.astype(dtype), statistics, report)
@@ -338,5 +358,6 @@ def run_to(problem: Problem, state: RolloutState, step: Any, statistics: RunStat
         statistics=statistics,
         final_collider_impulse=state.collider_impulse,
         final_boundary_impulse=state.boundary_impulse,
+        final_memory=state.memory,
         **saved,
     )

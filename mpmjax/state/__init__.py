@@ -37,6 +37,7 @@ from mpmjax.state._particles import (
     history_arrays as history_arrays,
     join as join,
     state_of as state_of,
+    with_dust as with_dust,
     with_state as with_state,
 )
 from mpmjax.state._preparation import (

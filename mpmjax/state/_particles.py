@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, ParticleMatrix, ParticleScalar, ParticleVector, components
-from mpmjax.checks import checked, is_traced, require, require_fields, require_positive
+from mpmjax.checks import checked, is_traced, require, require_fields, require_finite, require_that
 
 Deformations = tuple[Float[Array, "..."] | None, ...]
 
@@ -22,7 +22,8 @@ Deformations = tuple[Float[Array, "..."] | None, ...]
 class Particles(eqx.Module):
     """A set of particles. `fill` makes x, v, mass and volume; `prepare` adds what the scene needs.
 
-    Only x, v, C, deformations and histories change with time. Every leaf is a float array of one dtype. Particles of
+    Only x, v, C, deformations and histories change with time, and in a run with a control mass and volume: particles
+    with none are not there (see `mpmjax.extensions.Inlet`). Every leaf is a float array of one dtype. Particles of
     several materials lie group after group (see `join`). Deformations and histories have one entry a material, None
     until they are known; `F` and `history` are those of the only material.
 
@@ -82,8 +83,14 @@ class Particles(eqx.Module):
             f"Particles of {len(self.sizes)} materials need as many deformations and histories, got {lengths[0]} and "
             f"{lengths[1]}: give the counts of all materials, or drop deformations and histories.",
         )
-        require_positive("Particle masses [kg]", self.mass)
-        require_positive("Particle volumes [m^d]", self.volume)
+        require_finite("Particle masses [kg]", self.mass)
+        require_finite("Particle volumes [m^d]", self.volume)
+        require_that(
+            "Particle masses [kg] and volumes [m^d] must be greater than zero, or both zero of one that is not there",
+            lambda m, v: ((m > 0) & (v > 0)) | ((m == 0) & (v == 0)),
+            self.mass,
+            self.volume,
+        )
 
     @property
     def count(self) -> int:
@@ -232,6 +239,8 @@ class State(eqx.Module):
     C: Float[Array, "*f p d d"] | None  # velocity gradients [1/s], shape (p, d, d)
     deformations: Deformations  # F or J of each material (see `Particles`)
     histories: tuple[Any, ...]  # what the law of each material remembers
+    mass: Float[Array, "*f p"] | None = None  # masses [kg], shape (p,); None where no control may change them
+    volume: Float[Array, "*f p"] | None = None  # undeformed volumes [m^d], likewise
 
     F, history = Particles.F, Particles.history
 
@@ -253,6 +262,20 @@ def history_arrays(held: Particles | State) -> list[tuple[str, slice, Any]]:
     ]
 
 
+_DUST = 2.0**-80  # below the rounding of any sum over particles
+
+
+def with_dust(particles: Particles) -> Particles:
+    """The particles, with those that have no mass as dust of about the others' density: no quotient is then 0/0, and
+    all sums stay as they are to the last digit."""
+
+    def some(a: ParticleScalar) -> ParticleScalar:
+        most = jax.lax.stop_gradient(a.max())
+        return jnp.where(a > 0, a, _DUST * jnp.where(most > 0, most, 1))
+
+    return eqx.tree_at(lambda q: (q.mass, q.volume), particles, (some(particles.mass), some(particles.volume)))
+
+
 def state_of(particles: Particles) -> State:
     """The evolving part of prepared particles."""
     return State(particles.x, particles.v, particles.C, particles.deformations, particles.histories)
@@ -260,5 +283,6 @@ def state_of(particles: Particles) -> State:
 
 def with_state(particles: Particles, state: State) -> Particles:
     """The particles with their evolving part replaced. It is of their shapes and dtype, so nothing is checked again."""
-    evolving = operator.attrgetter(*(field.name for field in fields(State)))
+    names = (field.name for field in fields(State))
+    evolving = operator.attrgetter(*(name for name in names if getattr(state, name) is not None))
     return eqx.tree_at(evolving, particles, evolving(state), is_leaf=lambda a: a is None)

@@ -15,7 +15,7 @@ from mpmjax.checks import canonical, checked, is_traced, require, require_finite
 from mpmjax.discretisation import Stencil
 from mpmjax.geometry import length
 from mpmjax.potential import Mirror
-from mpmjax.state import MaterialPoints, Particles, Scene, is_prepared, points_of, prepare, terms_of
+from mpmjax.state import MaterialPoints, Particles, Scene, is_prepared, points_of, prepare, terms_of, with_dust
 from mpmjax.stepping._contact_surfaces import contact_moduli
 from mpmjax.stepping._integrator import AbstractIntegrator, Explicit
 from mpmjax.stepping._nodes import start_nodes
@@ -153,6 +153,8 @@ def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator,
         UnknownBoundError: an integrator, transfer, gradient operator or term gives no bound.
     """
     scene, method, t = canonical((scene, method, t), particles.x.dtype)
+    if not is_traced(particles.mass) and not np.all(np.asarray(particles.mass)):
+        particles = with_dust(particles)
     return _limit(scene, particles if is_prepared(scene, particles) else prepare(scene, particles), method, t)
 
 

@@ -100,6 +100,8 @@ def render(
     if colour in _SMOOTHED:
         each = [jnp.asarray(a, run.final.x.dtype) for a in values]
         values = np.stack([np.asarray(smoothed(run.scene, run.frame(i), a)) for i, a in zip(shown, each, strict=True)])
+    there = np.stack([np.asarray(run.frame(i).mass) > 0 for i in shown])
+    values = np.where(there, values, np.nan)
     from matplotlib import cm, colormaps, colors, pyplot as plt  # here: it takes a second that only pictures should pay
 
     bar = None
@@ -136,6 +138,13 @@ def _remembered(name: str, scene: Any, particles: Particles) -> np.ndarray:
         if remembered == name:
             values[rows] = leaf
     return values
+
+
+def _volume(run: Run) -> np.ndarray:
+    """The undeformed volumes [m^d], (p,); of particles that enter or leave, those while they are there."""
+    assert run.frames is not None
+    changing = run.frames.volume
+    return np.asarray(run.final.volume if changing is None else np.asarray(changing).max(axis=0), float)
 
 
 def _colour_of(material: int, d: int) -> tuple[float, float, float]:
@@ -210,7 +219,7 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
 
     assert run.frames is not None
     turn = _upright(run.scene)
-    volume = np.asarray(run.final.volume, float)
+    volume = _volume(run)
     size = float(volume.mean()) ** (1 / 3)
     x = np.asarray(run.frames.x, float).reshape(-1, 3)
     lower, upper = x.min(axis=0) - size, x.max(axis=0) + size
@@ -281,7 +290,7 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
         facing = (normals @ light)[:, None]
         colour = np.concatenate([_tinted(particles, bar, values), np.tile(STONE, (len(rock), 1))])
         colour = np.clip(colour * np.where(facing > 0, 0.75 + 0.3 * facing, 0.75 + 0.4 * facing), 0, 1)
-        wide = np.concatenate([diameter, np.full(len(rock), 3 * spacing)])
+        wide = np.concatenate([diameter * (np.asarray(particles.mass) > 0), np.full(len(rock), 3 * spacing)])
         every = np.concatenate([x, rock])
         shadow = np.column_stack([every[:, :2], np.full(len(every), ground)])
         metre = float(np.linalg.norm(np.diff(on_paper(ends)[0], axis=0))) / (2 * size)  # in pixels, at the middle
@@ -327,7 +336,7 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
 
     assert run.frames is not None
     d, grid = run.final.dim, run.scene.grid
-    volume = np.asarray(grid.section(run.frames.x[0], run.final.volume), float)
+    volume = np.asarray(grid.section(run.frames.x[0], jnp.asarray(_volume(run))), float)
 
     def whole(x: np.ndarray) -> np.ndarray:
         """Points with those on the other side of the axis of a body of revolution."""
@@ -378,10 +387,11 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
     def draw(particles: Particles, values: np.ndarray, t: float) -> list[Any]:
         place, F = np.zeros((particles.count, 2)), np.tile(np.eye(2), (particles.count, 1, 1))
         place[:, :d] = particles.x
-        for rows, stored, history in by_material(particles):
+        for (rows, stored, _), law in zip(by_material(particles), run.scene.laws, strict=True):
             a = np.asarray(stored)
             F[rows, :d, :d] = a[:, :d, :d] if a.ndim == 3 else a[:, None, None] ** (1 / d) * np.eye(d)
-            F[rows] *= 2.0 if a.ndim == 1 or history is not None else 1.0  # F does not say how they are stretched
+            F[rows] *= 2.0 if a.ndim == 1 or law.relaxes_stress else 1.0  # F does not say how they are stretched
+        F *= (np.asarray(particles.mass) > 0)[:, None, None]  # others are not there
         square, colours = place[:, None] + np.einsum("pij,pkj->pki", F, corners), _tinted(particles, bar, values)
         squares.set_verts(whole(square))
         squares.set_facecolor(np.concatenate([colours, colours]) if grid.axisymmetric else colours)
