@@ -1,6 +1,9 @@
 """Controls: what a policy changes in each step, what enters and leaves; derivatives, files, faults."""
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import diffrax
 import equinox as eqx
@@ -253,6 +256,16 @@ def test_what_an_outlet_takes_is_gone_and_what_is_dug_leaves_a_hole(tmp_path):
     mpm.render(run, tmp_path / "run.png", colour="speed")
     fields = mpm.load(path, frame=0)
     assert_close(fields.final.mass, run.frames.mass[0])
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("name", "left"), [("soft_walker", "soft_walker.gif"), ("throw", "throw.png")])
+def test_the_examples_run(name, left, tmp_path):
+    """In their small size, as fresh programs in single precision."""
+    script = [sys.executable, str(Path(__file__).parents[1] / "examples" / f"{name}.py"), "--quick"]
+    ran = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert (tmp_path / left).exists()
 
 
 def test_masses_and_volumes_are_zero_together():
