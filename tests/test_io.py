@@ -835,7 +835,7 @@ def test_what_is_no_run_is_neither_saved_nor_loaded(bad, says, tmp_path, monkeyp
         save(tmp_path / "run.h5", bad())
     assert not list(tmp_path.iterdir())
     with monkeypatch.context() as patched:
-        patched.setattr(mpmjax.io._runs, "check_numbers", lambda *_: None)
+        patched.setattr(mpmjax.io._runs, "_check_numbers", lambda *_: None)
         save(tmp_path / "run.h5", bad())
     with pytest.raises(ValueError, match=rf"run\.h5 is damaged \({says}"):
         load(tmp_path / "run.h5")

@@ -22,7 +22,7 @@ from typing import Any, cast
 import jax
 import numpy as np
 
-from mpmjax.checks import canonical, require, require_finite, require_positive
+from mpmjax.checks import canonical, require
 from mpmjax.io._schema import decode, encode
 from mpmjax.io._transactional_file import StagedFile, reason, require_no_writer
 from mpmjax.simulation import Problem
@@ -412,15 +412,3 @@ def standing_in(path: Path) -> tuple[int, int]:
     with reading(path) as file:
         require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
         return count_in(file), int(file["mpmjax/frames"][count_in(file) - 1]["steps"])
-
-
-def check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
-    """Check that the step is positive, step numbers grow, states are finite, and positions are ones that a grid can
-    number."""
-    require_positive("dt [s]", dt)
-    require(steps[0] >= 0 and (np.diff(steps) > 0).all(), f"A run's steps must grow from 0 or later, got {steps}.")
-    most = float(scene.grid.spacing) * 2**31  # as far as nodes are numbered
-    for state in states:
-        for leaf in jax.tree.leaves(state):
-            require_finite("A run's frames", leaf)
-        require(np.abs(state.x).max(initial=0) < most, f"Positions must be below {most:.3g} m.")

@@ -32,10 +32,20 @@ from tqdm import tqdm
 
 from mpmjax._types import Scalar
 from mpmjax.analysis import energy
-from mpmjax.checks import canonical, checked, is_traced, require, require_memory, require_whole, requirements, warn
+from mpmjax.checks import (
+    canonical,
+    checked,
+    is_traced,
+    require,
+    require_finite,
+    require_memory,
+    require_positive,
+    require_whole,
+    requirements,
+    warn,
+)
 from mpmjax.io._frame_writer import FIELDS_WRITTEN, FrameWriter, at, check_fields, frames_in, new_writer
 from mpmjax.io._run_file import (
-    check_numbers,
     check_place,
     count_in,
     description_in,
@@ -202,13 +212,25 @@ def save(path: str | os.PathLike, run: Run, *, fields: tuple[str, ...] | list[st
     steps, frames = at((run.steps, run.frames), slice(count))
     last = RolloutState(_end_of(run, frames), run.final_collider_impulse, run.final_boundary_impulse, run.final_memory)
     states = (last.particles,) if frames is None else (frames, last.particles)
-    check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
+    _check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
     unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.statistics)
     with new_writer(path, Problem(run.scene, run.final, run.dt, run.method), last, fields) as writer:
         for i in range(count):
             frame = at((frames, run.collider_impulse, run.boundary_impulse, run.memory), i)
             writer.append(int(steps[i]), RolloutState(*frame), unknown)
         writer.append(final_step, last, run.statistics)
+
+
+def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
+    """Check that the step is positive, step numbers grow, states are finite, and positions are ones that a grid can
+    number."""
+    require_positive("dt [s]", dt)
+    require(steps[0] >= 0 and (np.diff(steps) > 0).all(), f"A run's steps must grow from 0 or later, got {steps}.")
+    most = float(scene.grid.spacing) * 2**31  # as far as nodes are numbered
+    for state in states:
+        for leaf in jax.tree.leaves(state):
+            require_finite("A run's frames", leaf)
+        require(np.abs(state.x).max(initial=0) < most, f"Positions must be below {most:.3g} m.")
 
 
 def _end_of(run: Run, like: State | None) -> State:
@@ -265,7 +287,7 @@ def load(path: str | os.PathLike, *, frame: int | None = None) -> Run:
 
         like = jax.eval_shape(begin)
         steps, frames, tallies = frames_in(file, like, start, stop)
-        check_numbers(scene, described["dt"], steps, frames.particles)
+        _check_numbers(scene, described["dt"], steps, frames.particles)
     last, statistics = at((frames, tallies), -1)
     return run_to(
         problem,
