@@ -16,10 +16,13 @@ _TURNED = (1 + 2**0.5) / 2
 
 
 class Activation(eqx.Module):
-    """The history of an `Active` law."""
+    """The history of an `Active` law.
+
+    Attributes:
+        activation: a [-], shape (q,): from 0, at rest, to 1.
+    """
 
     activation: Float[Array, "*q"]
-    """a [-], shape (q,): from 0, at rest, to 1."""
 
 
 class Active(AbstractInelastic):
@@ -105,8 +108,7 @@ class Contracted(AbstractMaterial):
         return MatrixDifferential(la.matrix_of(self.law.projected_differential(F), F) + fibres)
 
     def stiffness_eigenvalues(self, F: Matrix, dim: int, *, total: bool) -> Float[Array, "m p"]:
-        """Those of the law, each with a bound of what fibres add: no eigenvalue of a sum is beyond the sum of the
-        largest ones."""
+        """The law's, each with a bound of what fibres add: no eigenvalue of a sum is beyond the sum of the largest."""
         stretch = self._fibre(F)[2]
         most = jnp.abs(self.tension) * (1 / stretch if total else _TURNED * stretch)
         return self.law.stiffness_eigenvalues(F, dim, total=total) + most

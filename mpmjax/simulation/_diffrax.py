@@ -101,8 +101,8 @@ class Problem(eqx.Module):
     method: AbstractIntegrator  # the integrator
     stencil: Stencil | None = None  # in the total description, where it is made once
     observe: Callable[[Scene, Particles], Any] | None = None  # what is saved of each frame besides its state
-    control: Control | None = None  # acts before each step
-    memory: Any = None  # of the control, before the first step
+    control: Control | None = None  # what acts before each step
+    memory: Any = None  # the control's memory before the first step
     start: Scalar = 0.0  # number of the first step
     until: Scalar = np.inf  # number of steps after which a watched run ends, if it is less than were asked for
     slot: Scalar = 0.0  # zero; adjoint solves report through its cotangent (see `Reporting`)

@@ -183,6 +183,9 @@ class Run(eqx.Module):
             the scene has `boundary_forces`, or where nothing was saved.
         final_boundary_impulse: impulse on each of the scene's boundaries from the run's start to its end; None unless
             the scene has `boundary_forces`.
+        memory: the memory of the run's control at each saved frame, with a leading axis f; of a run from a file its
+            arrays.
+        final_memory: the memory of the control at the end, with which another run goes on.
     """
 
     scene: Scene
@@ -199,6 +202,8 @@ class Run(eqx.Module):
     final_collider_impulse: Impulses | None = None
     boundary_impulse: Impulses | None = None
     final_boundary_impulse: Impulses | None = None
+    memory: Any = None
+    final_memory: Any = None
 
     memory: Any = None
     """The memory of the run's control at each saved frame, with a leading axis f; of a run from a file its arrays."""
