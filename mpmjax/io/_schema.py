@@ -104,6 +104,7 @@ MADE: dict[str, tuple[Callable[..., Any], type]] = {"Mesh": (_mesh, SampledDista
 
 
 def known_classes() -> tuple[type, ...]:
+    """The classes that files can hold: the package's and those that are registered."""
     return (*saved_classes(), *_registered.values())
 
 
