@@ -105,7 +105,7 @@ class Contracted(AbstractMaterial):
         return MatrixDifferential(la.matrix_of(self.law.projected_differential(F), F) + fibres)
 
     def stiffness_eigenvalues(self, F: Matrix, dim: int, *, total: bool) -> Float[Array, "m p"]:
-        """Those of the law, each with a bound of what fibres add: no eigenvalue of a sum is beyond the sum of the
+        """The values of the law, each with a bound of what fibres add: no eigenvalue of a sum is beyond the sum of the
         largest ones."""
         stretch = self._fibre(F)[2]
         most = jnp.abs(self.tension) * (1 / stretch if total else _TURNED * stretch)

@@ -239,7 +239,7 @@ class State(eqx.Module):
     C: Float[Array, "*f p d d"] | None  # velocity gradients [1/s], shape (p, d, d)
     deformations: Deformations  # F or J of each material (see `Particles`)
     histories: tuple[Any, ...]  # what the law of each material remembers
-    mass: Float[Array, "*f p"] | None = None  # masses [kg], shape (p,); None, as the volumes, where no control changes them
+    mass: Float[Array, "*f p"] | None = None  # masses [kg], shape (p,); None where no control changes them
     volume: Float[Array, "*f p"] | None = None  # undeformed volumes V0 [m^d], shape (p,)
 
     F, history = Particles.F, Particles.history
