@@ -301,8 +301,8 @@ class Bounded(_PlainParameter):
         lower, upper: the bounds; all else see `Positive`.
     """
 
-    lower: float | int = eqx.field(static=True, default=0.0, converter=as_plain)
-    upper: float | int = eqx.field(static=True, default=1.0, converter=as_plain)
+    lower: float | int = eqx.field(static=True, default=0.0, converter=as_plain)  # the lower bound
+    upper: float | int = eqx.field(static=True, default=1.0, converter=as_plain)  # the upper bound
 
     def __check_init__(self):
         require_fields(self)

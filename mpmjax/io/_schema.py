@@ -7,8 +7,7 @@ An object is a table whose `kind` names its class and whose other keys are its c
 A key with a default may be left out, and so may `kind` where the package has one class that fits; an object without
 other keys may be written as its kind alone (transfer = "PIC"). What a key takes follows from the constructor's
 annotation, so a new public class of the package costs nothing here, and one of a user's own a call of `register`.
-Numbers come back bit for bit. A TOML scene is such data, and so is the JSON in a run's file. Reading it calls
-constructors of known classes and executes nothing else.
+Numbers come back bit for bit. A TOML scene and a run's JSON are such data; reading calls known constructors alone.
 """
 
 import difflib
@@ -104,6 +103,7 @@ MADE: dict[str, tuple[Callable[..., Any], type]] = {"Mesh": (_mesh, SampledDista
 
 
 def known_classes() -> tuple[type, ...]:
+    """The classes that files can hold: the package's and those that are registered."""
     return (*saved_classes(), *_registered.values())
 
 
