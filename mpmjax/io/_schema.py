@@ -104,6 +104,7 @@ MADE: dict[str, tuple[Callable[..., Any], type]] = {"Mesh": (_mesh, SampledDista
 
 
 def known_classes() -> tuple[type, ...]:
+    """The classes that files can hold, the registered ones among them, but for those of `equinox.nn`."""
     return (*saved_classes(), *_registered.values())
 
 
@@ -265,9 +266,8 @@ def _network(data: dict[str, Any], options: list[Any], where: str, arrays: dict[
             return data
         if "array" not in data:
             return decode(data, Callable, where, arrays)
-        name = data["array"]
-        _require(arrays is not None and name in arrays, where, f"refers to the array {name!r}, which is not there")
-        return (arrays or {})[name]
+        _require(data["array"] in (arrays or {}), where, f"has lost its array {data['array']!r}")
+        return (arrays or {})[data["array"]]
 
     kind: Any = getattr(eqx.nn, data["kind"].removeprefix("equinox.nn."), None)
     fits = isinstance(kind, type) and any(is_class(a, eqx.Module) and issubclass(kind, a) for a in options)
