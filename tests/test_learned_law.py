@@ -136,7 +136,7 @@ def test_what_files_do_not_know_of_a_network_is_refused():
     with pytest.raises(ValueError, match="only a run's file holds its weights"):
         encode(eqx.nn.Linear(2, 3, key=key))
     for change, message in (
-        ({"bias": {"array": "gone"}}, "refers to the array 'gone'"),
+        ({"bias": {"array": "gone"}}, "has lost its array 'gone'"),
         ({"more": 1}, "has other fields than a Linear of this version of equinox"),
         ({"kind": "equinox.nn.inference_mode"}, "cannot be the kind 'equinox.nn.inference_mode'"),
         (

@@ -7,7 +7,8 @@ An object is a table whose `kind` names its class and whose other keys are its c
 A key with a default may be left out, and so may `kind` where the package has one class that fits; an object without
 other keys may be written as its kind alone (transfer = "PIC"). What a key takes follows from the constructor's
 annotation, so a new public class of the package costs nothing here, and one of a user's own a call of `register`.
-Numbers come back bit for bit. A TOML scene and a run's JSON are such data; reading calls known constructors alone.
+Numbers come back bit for bit. A TOML scene is such data, and so is the JSON in a run's file. Reading it calls
+constructors of known classes and executes nothing else.
 """
 
 import difflib
@@ -103,7 +104,7 @@ MADE: dict[str, tuple[Callable[..., Any], type]] = {"Mesh": (_mesh, SampledDista
 
 
 def known_classes() -> tuple[type, ...]:
-    """The classes that files can hold: the package's and those that are registered."""
+    """The classes that files can hold, the registered ones among them, but for those of `equinox.nn`."""
     return (*saved_classes(), *_registered.values())
 
 
@@ -265,9 +266,8 @@ def _network(data: dict[str, Any], options: list[Any], where: str, arrays: dict[
             return data
         if "array" not in data:
             return decode(data, Callable, where, arrays)
-        name = data["array"]
-        _require(arrays is not None and name in arrays, where, f"refers to the array {name!r}, which is not there")
-        return (arrays or {})[name]
+        _require(data["array"] in (arrays or {}), where, f"has lost its array {data['array']!r}")
+        return (arrays or {})[data["array"]]
 
     kind: Any = getattr(eqx.nn, data["kind"].removeprefix("equinox.nn."), None)
     fits = isinstance(kind, type) and any(is_class(a, eqx.Module) and issubclass(kind, a) for a in options)
