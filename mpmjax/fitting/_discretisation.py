@@ -64,11 +64,11 @@ def changes_on_coarse_grid(
     return np.diff(places, axis=0)
 
 
-def changes_shown(problem: FitProblem, z: Coordinates, moved: Float[np.ndarray, "2 n"] | str | None) -> list[str]:
+def changes_shown(problem: FitProblem, z: np.ndarray, moved: Float[np.ndarray, "2 n"] | str | None) -> list[str]:
     """Lines that say where the minimum moves, as of `changes_on_coarse_grid`; none where it was not looked at."""
     if moved is None or isinstance(moved, str):
         return [f"on twice the spacing: not known: {moved}"] if moved else []
-    spacing, both = (problem.shown(place) for place in np.asarray(z, float) + np.cumsum(moved, axis=0))
+    spacing, both = (problem.shown(place) for place in z + np.cumsum(moved, axis=0))
     return [f"on twice the spacing: {spacing}", f"and with twice the step: {both}"]
 
 
