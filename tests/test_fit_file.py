@@ -115,7 +115,12 @@ def test_the_command_fits_prints_and_writes(bar, monkeypatch):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("line", "says"), [("starts = 3\nfraction = 1", "3 points, 3 searches"), ("horizons = [0.02]", "until")]
+    ("line", "says"),
+    [
+        ("starts = 3\nfraction = 1", "3 points, 3 searches"),
+        ("horizons = [0.02]", "until"),
+        ("discretisation = true", "on twice the spacing: "),
+    ],
 )
 def test_a_file_asks_for_a_better_start(bar, line, says):
     """Then for the fit from there, and the profile that the option names."""

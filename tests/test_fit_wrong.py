@@ -11,6 +11,7 @@ from test_fit import DT, NOISE, RATIO, experiment, tracks
 
 import mpmjax as mpm
 from mpmjax.fitting._estimate import shape_of
+from mpmjax.verification import StandingWave, discretise
 
 E, SIDE = 7e4, 0.4
 
@@ -47,8 +48,12 @@ def both_grids():
     return {n: motion(n, 80) for n in (1, 4)}
 
 
+def modulus(e):
+    return e.scene.material.youngs_modulus
+
+
 def stiffness(start):
-    return {"E": mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=start, unit="Pa")}
+    return {"E": mpm.Positive(modulus, start=start, unit="Pa")}
 
 
 def test_other_starts_are_tried_where_the_misfit_is_beyond_the_noise(both_grids):
@@ -94,7 +99,8 @@ def test_residuals_that_are_no_noise_are_named(both_grids):
         for sigma in (None, NOISE):
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                found = mpm.fit(swing(times, exact + noise, sigma=sigma), stiffness(6e4), starts=1)
+                seen = swing(times, exact + noise, sigma=sigma)
+                found = mpm.fit(seen, stiffness(6e4), starts=1, discretisation=False)
             (seen,), stiff, table = found.noise, found["E"], str(found)
             assert seen.shape == shape
             texts = [str(w.message) for w in caught]
@@ -130,6 +136,50 @@ def test_the_first_interval_holds_what_the_grid_gets_wrong(both_grids, steps):
     assert found.interval[0] < E < found.interval[1]
     assert abs(found.value - E) > 4 * found.noise_error
     assert found.interval[1] - found.interval[0] < 15 * abs(found.value - E)
+
+
+def wave(n):
+    """Two periods of the standing wave, its exact places with noise, by 32 particles on 16/n cells."""
+    exact = StandingWave(0.05)
+    scene, q = discretise(exact, 16)
+    t1 = 2 * exact.duration
+    times = np.arange(1, 21) * t1 / 20
+    which = np.arange(1, 32, 5)
+    x = np.array([[exact.position(X, t) for X in q.X[which]] for t in jnp.asarray(times)])
+    seen = mpm.Tracks(times, x + 1e-3 * np.random.default_rng(0).normal(size=x.shape), which=which, sigma=1e-3)
+    if n > 1:
+        scene = eqx.tree_at(lambda s: s.grid, scene, mpm.Grid((16,), n / 16, origin=(-4,)))
+    return mpm.Experiment(scene, q, t1=t1, dt=n * t1 / 80, observations=seen)
+
+
+def test_twice_the_spacing_tells_of_an_error_that_leaves_no_misfit():
+    """E of the exact wave is a per cent low, many times its error by the noise, and the misfit is that of the noise.
+    Spacing and step move it to opposite sides, together to where a fit on both ends; the interval holds each."""
+    guess = stiffness(2e4)
+    missed, found, coarse = (
+        mpm.fit(wave(n), guess, discretisation=looks) for n, looks in ((1, "auto"), (1, True), (2, False))
+    )
+    true, e = 1e4, found["E"]
+    assert missed.moved is None
+    assert missed["E"].interval == missed["E"].noise_interval == e.noise_interval
+    assert not e.noise_interval[0] < true < e.noise_interval[1]
+    assert e.interval[0] < true < e.interval[1]
+    assert e.interval[1] - e.interval[0] < 10 * abs(e.value - true)
+    by_spacing, by_step = found.moved[:, 0]
+    assert by_spacing > 0 > by_step
+    assert by_spacing + by_step == pytest.approx(np.log(coarse["E"].value / e.value), abs=0.03 * by_spacing)
+    assert e.error == pytest.approx(np.hypot(e.noise_error, e.value * np.hypot(by_spacing, by_step) / 2), rel=1e-6)
+    assert "on twice the spacing: E 1017" in str(found)
+    assert mpm.fitting.predict(found, modulus).error == pytest.approx(e.error, rel=1e-6)
+
+
+def test_a_wall_that_the_coarse_grid_cannot_have_is_said():
+    """A plane must lie at a multiple of half a spacing: of one that does not on twice the spacing nothing is known."""
+    experiment = wave(1)
+    shifted = eqx.tree_at(lambda e: e.scene.boundary[1].position, experiment, jnp.asarray(1.03125))
+    found, alone = (mpm.fit(shifted, stiffness(1e4), starts=1, discretisation=looks) for looks in (True, False))
+    assert found["E"].interval == alone["E"].interval
+    assert "on twice the spacing: not known: A SymmetryPlane must lie at a multiple" in str(found)
 
 
 def test_a_fit_on_finer_grids_starts_from_all_minima_and_says_what_its_misfit_is(both_grids):

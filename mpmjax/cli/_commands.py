@@ -245,6 +245,7 @@ def fit_scene(
             )
             fits, whole = outcome.fits, asked.refined(outcome.refinements[-1])[1]
         else:
+            common["discretisation"] = asked.discretisation
             outcome = fit(asked.experiments, asked.parameters, progress=progress, **common)
             fits, whole = (outcome,), asked.whole
         print(outcome)

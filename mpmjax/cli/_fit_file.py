@@ -45,6 +45,7 @@ class FitFile(NamedTuple):
     starts: Literal["auto"] | Starts  # from where it is searched
     horizons: tuple[float, ...] | bool  # until which times it is fitted first [s]; true to choose them, false for none
     refine: tuple[int, ...]  # on how many times as many cells a direction it is fitted besides; empty for none
+    discretisation: bool | Literal["auto"]  # whether a single grid's fit looks at twice the spacing
     whole: tuple[Experiment, ...]
     """The experiments over the whole of their runs, with all that was measured: also what is not fitted."""
     refined: Callable[[int], tuple[tuple[Experiment, ...], tuple[Experiment, ...]]]
@@ -106,7 +107,7 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
 
 
 _TABLES = ("parameter", "observation", "experiment", "report")
-_SETTINGS = ("level", "starts", "fraction", "horizons", "refine")
+_SETTINGS = ("level", "starts", "fraction", "horizons", "refine", "discretisation")
 _KEYS = {*_TABLES, *_SETTINGS, "t1", "optimiser"}
 
 
@@ -124,8 +125,9 @@ def fit_settings(
     fraction: Scalar | None = None,
     horizons: tuple[float, ...] | bool = False,
     refine: int | tuple[int, ...] = (),
+    discretisation: bool | Literal["auto"] = "auto",
 ) -> dict[str, Any]:
-    """Level, starts, horizons and refinements of a [fit] table."""
+    """Level, starts, horizons, refinements and discretisation of a [fit] table."""
     require(0 < level < 1, f"[fit] level must lie between 0 and 1, got {level!r}.")
     many = starts != "auto" and starts > 1
     require(starts == "auto" or starts > 0, f"[fit] starts must be one at least, got {starts}.")
@@ -135,7 +137,8 @@ def fit_settings(
     require(not (many and horizons), "[fit] takes either starts or horizons.")
     finer = refinements(refine if isinstance(refine, tuple) else (refine,), "[fit] refine")
     places = starts if starts == "auto" else Starts(starts, float(fraction))
-    return {"level": float(level), "starts": places, "horizons": horizons, "refine": finer}
+    sequence = {"starts": places, "horizons": horizons, "refine": finer}
+    return sequence | {"level": float(level), "discretisation": discretisation}
 
 
 def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:

@@ -118,6 +118,20 @@ class Grid(eqx.Module):
         """The grid with so many nodes at each place."""
         return replace(self, layers=count)
 
+    def coarsened(self) -> "Grid":
+        """The grid of twice the spacing, whose window reaches two of its spacings farther, but in periodic directions.
+
+        Raises:
+            ValueError: a period of an odd number of spacings.
+        """
+        odd = [n for n, periodic in zip(self.shape, self.periodic, strict=True) if periodic and n % 2]
+        require(not odd, f"A period of {odd[:1]} spacings is none of twice the spacing.")
+        margin = [0 if periodic else 2 for periodic in self.periodic]
+        first = tuple(i // 2 - m for i, m in zip(self.origin, margin, strict=True))
+        each = zip(self.origin, self.shape, margin, first, strict=True)
+        shape = tuple(n // 2 if m == 0 else -(-(i + n) // 2) + m - start for i, n, m, start in each)
+        return replace(self, shape=shape, origin=first, spacing=2 * self.spacing)
+
     def window(self, x: ParticleVector) -> Int[Array, "d"]:
         """Lattice index of the window's first node, shape (d,), for particles at x [m], shape (p, d)."""
         if not self.follow:

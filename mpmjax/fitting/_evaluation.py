@@ -157,6 +157,15 @@ def evaluated(
     return Evaluated(place, r, J, (problem.room(place), problem.room(z)), eqx.combine(runs, tuple(rest)))
 
 
+def residuals_at(
+    problem: FitProblem, points: Float[Array, "b n"], sigmas: Sigmas, kept: tuple[Kept, ...] | None
+) -> Float[Array, "b m"]:
+    """Residuals at some points together, without derivatives; `kept` as of `parts_kept`."""
+    if kept is None:
+        return _residuals_at_once(problem, points, sigmas)
+    return jax.vmap(lambda z: staged(problem, z, sigmas, kept)[0][0])(points)
+
+
 def costs_at(
     problem: FitProblem,
     points: Float[np.ndarray, "k n"],
@@ -169,10 +178,7 @@ def costs_at(
     costs, kept = np.empty(len(points)), parts_kept(problem, min(batch, len(points)))
     for first in range(0, len(points), batch):
         rows = jnp.asarray(points[np.minimum(np.arange(first, first + batch), len(points) - 1)], problem.dtype)
-        if kept is None:
-            r = _residuals_at_once(problem, rows, sigmas)
-        else:
-            r = jax.vmap(lambda z: staged(problem, z, sigmas, kept)[0][0])(rows)
+        r = residuals_at(problem, rows, sigmas, kept)
         costs[first : first + batch] = (np.asarray(r) ** 2).sum(axis=1)[: len(points) - first] / 2
         progress(min(first + batch, len(points)), len(points))
     return costs

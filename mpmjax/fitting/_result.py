@@ -11,6 +11,7 @@ import numpy as np
 
 from mpmjax._types import Array
 from mpmjax.checks import require
+from mpmjax.fitting._discretisation import changes_shown
 from mpmjax.fitting._estimate import IMPROBABLE, AbstractFit, Estimate, NoiseEstimate, Shape, improbable, shape_of
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._parameter import AbstractParameter
@@ -54,6 +55,7 @@ class FitResult(AbstractFit):
         history: the iterations of the search.
         warnings: directions that the data do not see, and a misfit that the noise does not explain, in words.
         interrupted: whether Ctrl-C ended it.
+        moved: how far z moves on twice the spacing, then with twice the step, shape (2, n); or why that is not known.
         screening: the other points from which the minimum was searched, if it was.
         remarks: how its start was come by, in words.
     """
@@ -77,6 +79,7 @@ class FitResult(AbstractFit):
     history: tuple[Iteration, ...]
     warnings: tuple[str, ...]
     interrupted: bool = False
+    moved: np.ndarray | str | None = None
     screening: Screening | None = None
     remarks: tuple[str, ...] = ()
 
@@ -237,6 +240,7 @@ class FitResult(AbstractFit):
         who = f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations"
         lost = [] if self.converged else ["NOT CONVERGED: errors hold only at a minimum."]
         looked = [] if self.screening is None else ["", str(self.screening)]
+        lost += changes_shown(self.problem, self.z, self.moved)
         before = [*self.remarks, ""] if self.remarks else []
         return "\n".join([*before, first, *many, *body, "", *noise, "", chi, who, *lost, *self.warnings, *looked])
 
@@ -282,8 +286,9 @@ def fit_result(
     settled: Noise,
     report: Mapping[str, Callable[[Experiment], Any]],
     level: float,
+    moved: np.ndarray | str | None = None,
 ) -> FitResult:
-    """The result at a minimum, whose residuals are in units of its search's noise; `report` and `level` as of `fit`."""
+    """The result at a minimum, with residuals in units of its search's noise; options as of `fit` and its result."""
     r, J = np.array(minimum.seen.residuals, float), np.array(minimum.seen.jacobian, float)
     eps, z, noises, of_noise, of_misfit = float(jnp.finfo(problem.dtype).eps), minimum.z, [], [], []
     each = zip(problem.observations, problem.rows, problem.noise_is_given, settled, strict=True)
@@ -310,7 +315,7 @@ def fit_result(
         )
     held, slope = at_bound(r, J, np.asarray(problem.room(z))), jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1]
     gradient, columns = (J.T @ r) * held, [problem.numbers(z), problem.numbers(jnp.zeros_like(z)), held]
-    noise_alone, errors = (uncertainty(J, eps, noises) for noises in (of_noise, of_misfit))
+    noise_alone, errors = uncertainty(J, eps, of_noise), uncertainty(J, eps, of_misfit, moved)
     for each in (errors, noise_alone):
         seen = np.isfinite(each.error)
         wider = np.where(seen, each.error, 1) / np.where(seen, noise_alone.error, 1)
@@ -355,6 +360,7 @@ def fit_result(
         history=minimum.history,
         warnings=tuple(seen_together(problem.labels, errors, problem.logarithmic)),
         interrupted=minimum.interrupted,
+        moved=moved,
     )
     texts = list(result.warnings)
     if result.p_value < IMPROBABLE:

@@ -273,6 +273,7 @@ def fit_refined(
             build(n),
             start,
             starts=places,
+            discretisation=False,
             report=report,
             level=level,
             optimiser=optimiser,

@@ -16,6 +16,7 @@ _AT_BOUND = 1e-2  # standard errors from a bound at which a number lies at it
 _NODES = 100  # nodes of Gauss-Hermite quadrature
 _MOST_SAID = 8  # directions that are named
 _NEARLY_ONE = 0.99  # correlation from which two parameters are said to be seen only together
+_COVERAGE = 2.0  # standard errors to which the grid convergence index reaches
 _PART = 0.1  # share of a direction's largest effect on the data from which a coordinate is named with it
 
 
@@ -30,7 +31,8 @@ class Uncertainty(NamedTuple):
     """Directions that the data hardly see, a tenth as well as each coordinate alone, one a column, shape (n, w)."""
     spectrum: np.ndarray  # the eigenvalues of the Fisher information JᵀJ, growing, shape (n,)
     directions: np.ndarray  # their eigenvectors, one a column, shape (n, n)
-    parts: tuple[np.ndarray, ...]  # the part of the covariance that each observation brings, (n, n)
+    parts: tuple[np.ndarray, ...]
+    """The part of the covariance that each observation brings, and last, if known, the discretisation, (n, n)."""
     freedoms: tuple[float, ...]  # degrees of freedom of the noise of each; infinite where it is known
 
     @property
@@ -107,11 +109,18 @@ def quantile(level: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray
     return np.where(normal, ndtri(p), stdtrit(np.where(normal, 1, degrees_of_freedom), p))
 
 
-def uncertainty(J: np.ndarray, eps: float, noises: Sequence[tuple[slice, float, float]]) -> Uncertainty:
+def uncertainty(
+    J: np.ndarray, eps: float, noises: Sequence[tuple[slice, float, float]], moved: np.ndarray | str | None = None
+) -> Uncertainty:
     """The uncertainty of the coordinates by J, the derivative of residuals in units of their noise, shape (m, n), of
     precision `eps`. `noises` are of each observation its rows, the factor by which the variance of its residuals is
     larger than one, and the degrees of freedom with which that is known: with factors c_k it is the covariance
-    (JᵀJ)⁻¹ Σ c_k J_kᵀJ_k (JᵀJ)⁻¹ (H. White, Econometrica 48 (1980) 817, doi 10.2307/1912934)."""
+    (JᵀJ)⁻¹ Σ c_k J_kᵀJ_k (JᵀJ)⁻¹ (H. White, Econometrica 48 (1980) 817, doi 10.2307/1912934).
+
+    `moved` is how far the minimum moves on twice the spacing, and then with twice the step, each Δ of shape (n,). The
+    covariance then has Σ Δ Δᵀ/4 besides: the 95 % interval of the grid convergence index, two grids and the order two,
+    reaches 3 |Δ|/(2² − 1) to each side (P. J. Roache, J. Fluids Eng. 116 (1994) 405, doi 10.1115/1.2910291). Of the
+    step, whose order is one, |Δ| is the error itself."""
     n = J.shape[1]
     length = np.linalg.norm(J, axis=0)
     length = np.where(length == 0, 1, length)
@@ -128,6 +137,9 @@ def uncertainty(J: np.ndarray, eps: float, noises: Sequence[tuple[slice, float, 
     inverse = inverse + sum((c - 1) * part for (_, c, _), part in zip(noises, parts, strict=True))
     parts = tuple(c * part for (_, c, _), part in zip(noises, parts, strict=True))
     freedoms = tuple(freedom for *_, freedom in noises)
+    if isinstance(moved, np.ndarray):
+        part = moved.T @ moved / _COVERAGE**2
+        inverse, parts, freedoms = inverse + part, (*parts, part), (*freedoms, np.inf)
     unseen, weak = (a / np.maximum(np.linalg.norm(a, axis=0), np.finfo(float).tiny) for a in (unseen, weak))
     return Uncertainty(inverse, unseen, weak, np.maximum(spectrum, 0), directions, parts, freedoms)
 

@@ -1,0 +1,75 @@
+"""How far a minimum moves on twice the spacing and step: the part of its error that the discretisation makes."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Float
+from mpmjax.fitting._evaluation import parts_kept, residuals_at
+from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._uncertainty import uncertainty
+
+
+def coarsened(experiment: Experiment, longer: int) -> Experiment:
+    """The experiment on twice the spacing, its steps so many times longer, or the next of which t1 is a whole number.
+
+    Raises:
+        ValueError: the coarse grid does not fit a wall that must lie on its nodes, or a period.
+    """
+    scene = eqx.tree_at(lambda s: s.grid, experiment.scene, experiment.scene.grid.coarsened())
+    return Experiment(
+        scene,
+        experiment.particles,
+        t1=experiment.t1,
+        dt=experiment.t1 / -(-experiment.steps // longer),
+        observations=experiment.observations,
+        method=experiment.method,
+        name=experiment.name,
+    )
+
+
+def changes_on_coarse_grid(
+    problem: FitProblem, z: Coordinates, sigmas: Sigmas, jacobian: Float[np.ndarray, "m n"]
+) -> Float[np.ndarray, "2 n"] | str:
+    """How far the minimum z moves on twice the spacing, and from there with twice the step; or why that is not known.
+    They are two numbers because errors of spacing and step often have opposite signs.
+
+    Gauss-Newton steps −(JᵀJ)⁻¹ Jᵀ r with the residuals r of the coarse grid and the Jacobian of the fine one, three at
+    most of each, while they lower Σ r². What a bound holds has no column in the Jacobian.
+    """
+    inverse = uncertainty(jacobian, float(jnp.finfo(problem.dtype).eps), ()).inverse
+    places = [np.asarray(z, float)]
+    for longer in (1, 2):
+        try:
+            experiments = tuple(coarsened(e, longer) for e in problem.experiments)
+        except ValueError as error:
+            return str(error)
+        coarse, least, tried = eqx.tree_at(lambda p: p.experiments, problem, experiments), np.inf, places[-1:]
+        kept = parts_kept(coarse, 1)
+        for _ in range(_STEPS):
+            try:
+                r = np.asarray(residuals_at(coarse, jnp.asarray(tried[-1:], problem.dtype), sigmas, kept), float)[0]
+            except KeyboardInterrupt:
+                return "interrupted."
+            if not (r**2).sum() < least:
+                # The first step stays even so: it is what a linear model says.
+                tried = tried[: max(len(tried) - 1, 2)]
+                break
+            least = (r**2).sum()
+            tried.append(tried[-1] - inverse @ (jacobian.T @ r))
+        if not np.isfinite(least):
+            return "the simulation fails there."
+        places.append(tried[-1])
+    return np.diff(places, axis=0)
+
+
+def changes_shown(problem: FitProblem, z: np.ndarray, moved: Float[np.ndarray, "2 n"] | str | None) -> list[str]:
+    """Lines that say where the minimum moves, as of `changes_on_coarse_grid`; none where it was not looked at."""
+    if moved is None or isinstance(moved, str):
+        return [f"on twice the spacing: not known: {moved}"] if moved else []
+    spacing, both = (problem.shown(place) for place in z + np.cumsum(moved, axis=0))
+    return [f"on twice the spacing: {spacing}", f"and with twice the step: {both}"]
+
+
+_STEPS = 3
