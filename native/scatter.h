@@ -17,6 +17,7 @@ namespace {
 
 using mpmjax::Average;
 using mpmjax::kChunk;
+using mpmjax::P2G;
 using mpmjax::Range;
 using mpmjax::Scatter;
 
@@ -321,8 +322,8 @@ void scatter(const Scatter<T>& task, int64_t first, int64_t last) {
 }
 
 // Of nodes from a first to before a last, all columns, or where `columns` is 0 any number of them.
-template <class T, int columns>
-void divide(const Average<T>& task, int64_t first, int64_t last) {
+template <class T, int columns, class Problem>
+void divide(const Problem& task, int64_t first, int64_t last) {
   const int64_t c = columns == 0 ? task.columns : columns, others = c - 1;
   const T least = task.least[0];
   for (int64_t i = first; i < last; ++i) {
@@ -334,8 +335,9 @@ void divide(const Average<T>& task, int64_t first, int64_t last) {
   }
 }
 
-template <class T, int d, int s>
-void average(const Average<T>& task, int64_t first, int64_t last) {
+// Sets the nodes of an average, whose sums `add` adds.
+template <class T, int d, int s, class Problem, class Add>
+MPMJAX_INLINE void average_of(const Problem& task, int64_t first, int64_t last, const Add& add) {
   const int64_t columns = task.columns, others = columns - 1;
   if (task.reached != nullptr) mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
   over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
@@ -346,12 +348,56 @@ void average(const Average<T>& task, int64_t first, int64_t last) {
       wipe(task.means, task.size * others, from * others, to * others);
     }
   });
-  const Scatter<T> sums = {task.stencils, task.values, task.sums, task.ranges, nullptr, task.size, columns, nullptr};
-  add_all<T, d, s>(sums, first, last);
+  add();
   over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
     if (!reached) return;
-    if (columns == 4) return divide<T, 4>(task, from, to);
-    columns == 3 ? divide<T, 3>(task, from, to) : divide<T, 0>(task, from, to);
+    if (columns == d + 1) return divide<T, d + 1>(task, from, to);
+    divide<T, 0>(task, from, to);
+  });
+}
+
+template <class T, int d, int s>
+void average(const Average<T>& task, int64_t first, int64_t last) {
+  const Scatter<T> sums = {task.stencils, task.values, task.sums, task.ranges, nullptr, task.size, task.columns, nullptr};
+  average_of<T, d, s>(task, first, last, [&] { add_all<T, d, s>(sums, first, last); });
+}
+
+template <class T, int d, int s>
+void p2g(const P2G<T>& task, int64_t first, int64_t last) {
+  using B = Block<T, d, s>;
+  using V = typename B::BlockVector;
+  const int64_t particles = task.stencils.particles;
+  const T spacing = 1 / task.slope[0], factor = task.factor[0] * task.slope[0];
+  const auto give = [&](const B&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
+    const auto read = [&](const T* array, int row) MPMJAX_INLINE_LAMBDA {
+      return B::load_block(array + row * particles + start, count);
+    };
+    alignas(64) T columns[d + 1][kBlock];
+    const V m = read(task.mass, 0);
+    for (int r = 0; r < d; ++r) store(columns[r], m * read(task.v, r));
+    store(columns[d], m);
+    to_rows<T, d + 1>(columns, rows[0]);
+    for (int b = 0; b < d; ++b) {
+      V a[d] = {};
+      if (task.A != nullptr) {
+        for (int r = 0; r < d; ++r) {
+          if (task.B == nullptr) a[r] = read(task.A, d * r + b);
+          for (int k = 0; k < d && task.B != nullptr; ++k) a[r] += read(task.A, d * r + k) * read(task.B, d * b + k);
+          a[r] *= factor;
+        }
+      }
+      if (task.C != nullptr) {
+        V moment = V{} + (s == 3 ? T(1) / 4 : T(1) / 3);
+        if (s == 2) moment = T(0.25) - read(task.stencils.offset, b) * read(task.stencils.offset, b);
+        for (int r = 0; r < d; ++r) a[r] += spacing * moment * m * read(task.C, d * r + b);
+      }
+      for (int r = 0; r < d; ++r) store(columns[r], a[r]);
+      to_rows<T, d>(columns, rows[b + 1]);
+    }
+  };
+  average_of<T, d, s>(task, first, last, [&] {
+    const NodeSums<T, s, d + 1> nodes(task.sums, d + 1, 0, first, last);
+    add_blocks<T, d, s, true, d + 1>(task.stencils, task.ranges, nodes, give);
   });
 }
 

@@ -139,6 +139,16 @@ void average(const Pool& pool, int64_t batch, const Average<T>& all) {
 }
 
 template <class T>
+void p2g(const Pool& pool, int64_t batch, const P2G<T>& all) {
+  set_nodes(pool, batch, all, kernels_of(all), kernels_of(all).p2g);
+}
+
+template <class T>
+void g2p(const Pool& pool, int64_t batch, const G2P<T>& all) {
+  over_particles(pool, batch, all, kernels_of(all).g2p);
+}
+
+template <class T>
 Division divided(const Pool& pool, int64_t batch, const Resist<T>& all) {
   return divide(pool, batch, all, kernels_of(all));
 }
@@ -160,6 +170,8 @@ void resist(const Pool& pool, int64_t batch, const Resist<T>& all, const Divisio
   template void gather(const Pool&, int64_t, const Gather<T>&);         \
   template void scatter(const Pool&, int64_t, const Scatter<T>&);       \
   template void average(const Pool&, int64_t, const Average<T>&);       \
+  template void p2g(const Pool&, int64_t, const P2G<T>&);               \
+  template void g2p(const Pool&, int64_t, const G2P<T>&);               \
   template void pull(const Pool&, int64_t, const Pull<T>&);             \
   template Division divided(const Pool&, int64_t, const Resist<T>&);    \
   template void resist(const Pool&, int64_t, const Resist<T>&, const Division&);
