@@ -65,7 +65,8 @@ struct Kernels {
   void (*gather)(const Gather<T>&, int64_t first, int64_t last);
   void (*scatter)(const Scatter<T>&, int64_t first, int64_t last);
   void (*average)(const Average<T>&, int64_t first, int64_t last);
-  void (*find_ranges)(const Stencils<T>&, int64_t first_block, int64_t last_block, Range* ranges);
+  void (*find_ranges)(const Stencils<T>&, int64_t first_block, int64_t last_block, Range* ranges, int64_t size,
+                      bool* reached);
   void (*pull)(const Pull<T>&, int64_t first, int64_t last);
   void (*resist)(const Resist<T>&, int64_t first, int64_t last);
   void (*resist_particles)(const Resist<T>&, int64_t first, int64_t last);

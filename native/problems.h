@@ -108,7 +108,7 @@ struct Scatter {
   ParticleValues<T> values;
   T* nodes;
   const Range* ranges;  // of each block, or null
-  bool* reached;        // false, for each block of kChunk nodes; or null, where nodes are few
+  const bool* reached;  // which blocks of kChunk nodes particles reach; or null, where nodes are few
   int64_t size;
   int64_t columns;
   const bool* wanted;  // which blocks of kChunk numbers are, null for all; others may become anything
@@ -130,7 +130,7 @@ struct Average {
   T* means;             // the others divided by it
   T* sums;              // memory to work in
   const Range* ranges;  // as in a scatter, and so the next
-  bool* reached;
+  const bool* reached;
   int64_t size;
   int64_t columns;
 
@@ -153,7 +153,7 @@ struct P2G {
   const T *C, *A, *B;   // of each particle d rows of d
   T *whole, *means, *sums;  // as in an average, and so the next
   const Range* ranges;
-  bool* reached;
+  const bool* reached;
   int64_t size;
   int64_t columns;  // d + 1
 

@@ -73,23 +73,19 @@ MPMJAX_INLINE Range range_of(const int32_t* least, const int32_t* most, int coun
   return range;
 }
 
-// Marks the blocks of kChunk nodes, of a range from a first to before a last, that particles reach. Those of a block
-// of particles reach, for each index of the first axis, from the least to the most that the axes after it add.
+// Marks the blocks of kChunk nodes that a block of particles reaches: for each index of the first axis, from the least to
+// the most that the axes after it add. Several threads mark at a time.
 template <class T, int d, int s>
-void mark(const Stencils<T>& stencils, const Range* ranges, bool* reached, int64_t first, int64_t last) {
-  for (int64_t start = 0; start < stencils.particles; start += kBlock) {
-    const Range range = ranges[start / kBlock];
-    if (range.most < first || range.least >= last) continue;
-    const int count = smaller(stencils.particles - start, kBlock);
-    Block<T, d, s> block;
-    block.find_range(stencils, start, count);
-    const Range beyond = range_of(block.least_beyond, block.most_beyond, count);
-    for (int i = 0; i < s; ++i) {
-      for (int q = 0; q < count; ++q) {
-        const int64_t term = block.index[0][i][q];
-        if (q > 0 && term == block.index[0][i][q - 1]) continue;
-        const int64_t from = std::max(term + beyond.least, first), to = std::min(term + beyond.most, last - 1);
-        for (int64_t k = from / kChunk; from <= to && k <= to / kChunk; ++k) reached[k] = true;
+void mark(const Block<T, d, s>& block, int count, int64_t size, bool* reached) {
+  const Range beyond = range_of(block.least_beyond, block.most_beyond, count);
+  for (int i = 0; i < s; ++i) {
+    const BlockInt terms = load_as<BlockInt>(block.index[0][i]);
+    const int some = any(terms ^ terms[0]) ? count : 1;
+    for (int q = 0; q < some; ++q) {
+      const int64_t from = std::max<int64_t>(int64_t(terms[q]) + beyond.least, 0);
+      const int64_t to = std::min<int64_t>(int64_t(terms[q]) + beyond.most, size - 1);
+      for (int64_t k = from / kChunk; from <= to && k <= to / kChunk; ++k) {
+        __atomic_store_n(reached + k, true, __ATOMIC_RELAXED);
       }
     }
   }
@@ -224,14 +220,15 @@ struct Scatterer {
   }
 };
 
-// The ranges of all blocks from a first to a last.
+// The ranges of all blocks from a first to a last, and where there are so many nodes to mark, those that they reach.
 template <class T, int d, int s>
-void find_ranges(const Stencils<T>& stencils, int64_t first, int64_t last, Range* ranges) {
+void find_ranges(const Stencils<T>& stencils, int64_t first, int64_t last, Range* ranges, int64_t size, bool* reached) {
   for (int64_t k = first; k < last; ++k) {
     const int count = smaller(stencils.particles - k * kBlock, kBlock);
     Block<T, d, s> block;
     block.find_range(stencils, k * kBlock, count);
     ranges[k] = range_of(block.least, block.most, count);
+    if (reached != nullptr) mark<T, d, s>(block, count, size, reached);
   }
 }
 
@@ -310,7 +307,6 @@ void add_all(const Scatter<T>& task, int64_t first, int64_t last) {
 template <class T, int d, int s>
 void scatter(const Scatter<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns;
-  if (task.reached != nullptr) mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
   over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
     if (reached) {
       clear(task.nodes, task.wanted, from * columns, to * columns);
@@ -339,7 +335,6 @@ void divide(const Problem& task, int64_t first, int64_t last) {
 template <class T, int d, int s, class Problem, class Add>
 MPMJAX_INLINE void average_of(const Problem& task, int64_t first, int64_t last, const Add& add) {
   const int64_t columns = task.columns, others = columns - 1;
-  if (task.reached != nullptr) mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
   over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
     if (reached) {
       clear(task.sums, nullptr, from * columns, to * columns);

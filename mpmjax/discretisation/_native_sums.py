@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array
-from mpmjax.discretisation._stencil import Basis, Stencil
+from mpmjax.discretisation._stencil import Basis
 
 Call = Callable[..., list[Array]]
 """A kernel as a function of operands, attributes, and results if they are not those of the sum (see
@@ -130,7 +130,7 @@ def call_average(
 
 
 def call_p2g(
-    call: Call, stencil: Stencil, least: Array, mass: Array, v: Array, C: Any, impulse: Any, *, basis: Basis, size: int
+    call: Call, stencil: Any, least: Array, mass: Array, v: Array, C: Any, impulse: Any, *, basis: Basis, size: int
 ) -> list[Array] | None:
     """`p2g_sum`, but for stencils with gradients of their own or without any."""
     if stencil.own_derivatives is not None or stencil.flat is not None or (C is None and impulse is None):
@@ -145,12 +145,12 @@ def call_p2g(
 
 
 def call_g2p(
-    call: Call, stencil: Stencil, nodes: Array, dt: Array, x: Array, F: Any, *, basis: Basis
-) -> tuple[Array, ...] | None:
+    call: Call, stencil: Any, nodes: Array, dt: Array, x: Array, F: Any, *, basis: Basis
+) -> list[Array] | None:
     """`g2p_sum`, but for stencils with gradients of their own or without any. Particles are moved in place."""
     if stencil.own_derivatives is not None or stencil.flat is not None:
         return None
     operands, aliases = [stencil.first, stencil.offset, nodes, stencil.slope, dt, x], {5: 2}
     if F is not None:
         operands, aliases = [*operands, F], {5: 2, 6: 3}
-    return (*call(operands, basis_attributes(basis), aliases=aliases), *([None] if F is None else []))
+    return call(operands, basis_attributes(basis), aliases=aliases)
