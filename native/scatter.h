@@ -359,36 +359,42 @@ void average(const Average<T>& task, int64_t first, int64_t last) {
 
 template <class T, int d, int s>
 void p2g(const P2G<T>& task, int64_t first, int64_t last) {
-  using B = Block<T, d, s>;
-  using V = typename B::BlockVector;
+  using V = Simd<T>;
   const int64_t particles = task.stencils.particles;
   const T spacing = 1 / task.slope[0], factor = task.factor[0] * task.slope[0];
-  const auto give = [&](const B&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
-    const auto read = [&](const T* array, int row) MPMJAX_INLINE_LAMBDA {
-      return B::load_block(array + row * particles + start, count);
-    };
-    alignas(64) T columns[d + 1][kBlock];
-    const V m = read(task.mass, 0);
-    for (int r = 0; r < d; ++r) store(columns[r], m * read(task.v, r));
-    store(columns[d], m);
-    to_rows<T, d + 1>(columns, rows[0]);
-    for (int b = 0; b < d; ++b) {
-      V a[d] = {};
-      if (task.A != nullptr) {
+  const auto give = [&](const auto&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
+    alignas(64) T columns[d + 1][d + 1][kBlock] = {};  // of the value, and of the gradient along each axis
+    for (int q = 0; q < count; q += kSimdLanes<T>) {
+      const ParticleLanes<T> lanes(start + q, start + count, particles);
+      by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
+        const auto read = [&](const T* array, int row) MPMJAX_INLINE_LAMBDA {
+          prefetch(array + row * particles + start + q);
+          return lanes.template load<all>(array, row);
+        };
+        const V m = read(task.mass, 0);
+        for (int r = 0; r < d; ++r) store(columns[0][r] + q, m * read(task.v, r));
+        store(columns[0][d] + q, m);
+        V A[d][d] = {}, B[d][d] = {}, C[d][d] = {};
         for (int r = 0; r < d; ++r) {
-          if (task.B == nullptr) a[r] = read(task.A, d * r + b);
-          for (int k = 0; k < d && task.B != nullptr; ++k) a[r] += read(task.A, d * r + k) * read(task.B, d * b + k);
-          a[r] *= factor;
+          for (int b = 0; b < d; ++b) {
+            if (task.C != nullptr) C[r][b] = m * read(task.C, d * r + b);
+            if (task.A != nullptr) A[r][b] = factor * read(task.A, d * r + b);
+            if (task.B != nullptr) B[r][b] = read(task.B, d * r + b);
+          }
         }
-      }
-      if (task.C != nullptr) {
-        V moment = V{} + (s == 3 ? T(1) / 4 : T(1) / 3);
-        if (s == 2) moment = T(0.25) - read(task.stencils.offset, b) * read(task.stencils.offset, b);
-        for (int r = 0; r < d; ++r) a[r] += spacing * moment * m * read(task.C, d * r + b);
-      }
-      for (int r = 0; r < d; ++r) store(columns[r], a[r]);
-      to_rows<T, d>(columns, rows[b + 1]);
+        for (int b = 0; b < d; ++b) {
+          V moment = V{} + (s == 3 ? T(1) / 4 : T(1) / 3);
+          if (s == 2) moment = T(0.25) - read(task.stencils.offset, b) * read(task.stencils.offset, b);
+          for (int r = 0; r < d; ++r) {
+            V sum = spacing * moment * C[r][b];
+            if (task.A != nullptr && task.B == nullptr) sum += A[r][b];
+            for (int k = 0; k < d && task.B != nullptr; ++k) sum += A[r][k] * B[b][k];
+            store(columns[b + 1][r] + q, sum);
+          }
+        }
+      });
     }
+    for (int b = 0; b <= d; ++b) to_rows<T, d + 1>(columns[b], rows[b]);
   };
   average_of<T, d, s>(task, first, last, [&] {
     const NodeSums<T, s, d + 1> nodes(task.sums, d + 1, 0, first, last);
