@@ -65,7 +65,7 @@ def name_of(equation):
 
 
 def inner_programs(equation):
-    """The programs in an equation's parameters, of a function with a derivative rule, a transfer or a solve; not of sums."""
+    """The programs in an equation's parameters: of a function with a rule, a transfer or a solve; not of sums."""
     call = equation.params.get("call")
     if isinstance(call, _Call):
         if call.function.kernel in (None, "p2g", "g2p", "solve"):
