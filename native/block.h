@@ -96,47 +96,45 @@ struct Block {
   int32_t least[kBlock], most[kBlock];
   int32_t least_beyond[kBlock], most_beyond[kBlock];
 
-  typedef T BlockVector __attribute__((vector_size(kBlock * sizeof(T))));
-
   // The polynomials, with derivatives along some axes, a bit each, times dt if there is one; those of no particle are
   // zero. The index is read by `find_range`.
   MPMJAX_NOINLINE void evaluate(const Stencils<T>& from, int64_t first, int count, unsigned differentiated = 0) {
     for (int a = 0; a < d; ++a) {
-      const int64_t at = a * from.particles + first;
-      const BlockVector t = load_block(from.offset + at, count), one = BlockVector{} + 1;
-      if (differentiated >> a & 1) {
-        set<1>(from.basis, a, t, count, from.change == nullptr ? one : load_block(from.change + at, count));
+      T t[kBlock], dt[kBlock];
+      copy(from.offset + a * from.particles + first, count, t);
+      if (!(differentiated >> a & 1)) {
+        set<0>(from.basis, a, t, count, nullptr);
+      } else if (from.change == nullptr) {
+        set<1>(from.basis, a, t, count, nullptr);
       } else {
-        set<0>(from.basis, a, t, count, one);
+        copy(from.change + a * from.particles + first, count, dt);
+        set<1>(from.basis, a, t, count, dt);
       }
     }
   }
 
   template <int order>
-  MPMJAX_INLINE void set(const mpmjax::Basis<T>& basis, int a, BlockVector t, int count, BlockVector factor) {
+  MPMJAX_INLINE void set(const mpmjax::Basis<T>& basis, int a, const T* t, int count, const T* factor) {
     polynomials<order>(basis, basis.weights, t, count, factor, weights[a]);
     polynomials<order>(basis, basis.slopes, t, count, factor, slopes[a]);
   }
 
-  // Σ_k c_k (t − τ)^k for each node, or the derivative Σ_k k c_k (t − τ)^(k−1), times a factor.
+  // Σ_k c_k (t − τ)^k for each node, or the derivative Σ_k k c_k (t − τ)^(k−1), times a factor if there is one.
   template <int order>
-  static MPMJAX_INLINE void polynomials(const mpmjax::Basis<T>& basis, const T (*c)[mpmjax::kMostTerms], BlockVector t,
-                                        int count, BlockVector factor, T (*to)[kBlock]) {
-    BlockVector x[s], sum[s] = {};
+  static MPMJAX_INLINE void polynomials(const mpmjax::Basis<T>& basis, const T (*c)[mpmjax::kMostTerms], const T* t,
+                                        int count, const T* factor, T (*to)[kBlock]) {
+    for (int q = 0; q < kBlock; q += kSimdLanes<T>) {
+      Simd<T> x[s], sum[s] = {};
 #pragma GCC unroll 4
-    for (int i = 0; i < s; ++i) x[i] = t - basis.knots[i];
-    for (int k = basis.terms - 1; k >= order; --k) {
+      for (int i = 0; i < s; ++i) x[i] = load_as<Simd<T>>(t + q) - basis.knots[i];
+      for (int k = basis.terms - 1; k >= order; --k) {
 #pragma GCC unroll 4
-      for (int i = 0; i < s; ++i) sum[i] = sum[i] * x[i] + (order == 1 ? k * c[i][k] : c[i][k]);
+        for (int i = 0; i < s; ++i) sum[i] = sum[i] * x[i] + (order == 1 ? k * c[i][k] : c[i][k]);
+      }
+#pragma GCC unroll 4
+      for (int i = 0; i < s; ++i) store(to[i] + q, factor == nullptr ? sum[i] : sum[i] * load_as<Simd<T>>(factor + q));
     }
-#pragma GCC unroll 4
-    for (int i = 0; i < s; ++i) put(sum[i] * factor, count, to[i]);
-  }
-
-  static MPMJAX_INLINE BlockVector load_block(const T* from, int count) {
-    T numbers[kBlock];
-    copy(from, count, numbers);
-    return load_as<BlockVector>(numbers);
+    for (int i = 0; i < s && count < kBlock; ++i) std::memset(to[i] + count, 0, (kBlock - count) * sizeof(T));
   }
 
   // Stores numbers of a block, those of no particle as zero.

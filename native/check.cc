@@ -208,6 +208,77 @@ void check_average(const Example<T>& e, const std::vector<const Pool*>& pools) {
   }
 }
 
+// P2G against an average of what it makes of its arrays, G2P against a gather, in place and apart.
+template <class T>
+void check_moves(const Example<T>& e, std::mt19937& random, const std::vector<const Pool*>& pools) {
+  const Shape& sh = e.shape;
+  const int d = sh.d, m = d * d;
+  const int64_t p = sh.particles, n = sh.size();
+  const Array<T> slope(sh.batch), factor(sh.batch), least(sh.batch), mass(sh.batch * p), x(sh.batch * d * p);
+  const Array<T> A(sh.batch * m * p), B(A), C(A), values(sh.batch * (d + 1) * p), gradients(A);
+  for (const Array<T>* array : {&slope, &factor, &mass, &x, &A, &B, &C}) array->draw(random);
+  for (const Array<T>* array : {&mass, &slope, &least}) {
+    for (int64_t i = 0; i < array->size; ++i) (*array)[i] = 1 + std::abs((*array)[i]);
+  }
+  const Array<T> whole(sh.batch * n), means(sh.batch * n * d), sums(sh.batch * n * (d + 1));
+  for (int kind = 0; kind < 4; ++kind) {  // both terms, C alone, A Bᵀ alone, A alone
+    const bool affine = kind < 2, pushed = kind != 1, factored = pushed && kind < 3;
+    for (int64_t i = 0; i < sh.batch * p; ++i) {
+      const int64_t b = i / p, k = i % p;
+      const auto at = [&](const Array<T>& a, int64_t rows, int64_t row) -> T& { return a[(b * rows + row) * p + k]; };
+      for (int r = 0; r < d; ++r) at(values, d + 1, r) = mass[i] * at(x, d, r);
+      at(values, d + 1, d) = mass[i];
+      for (int c = 0; c < d; ++c) {
+        const double t = e.offset[(b * d + c) * p + k];
+        const double moment = sh.s == 2 ? 0.25 - t * t : sh.s == 3 ? 1 / 4.0 : 1 / 3.0;
+        for (int r = 0; r < d; ++r) {
+          double product = factored ? 0 : at(A, m, d * r + c);
+          for (int l = 0; l < d && factored; ++l) product += double(at(A, m, d * r + l)) * at(B, m, d * c + l);
+          const double turned = double(mass[i]) * at(C, m, d * r + c) * moment / slope[b];
+          at(gradients, m, d * c + r) = T((pushed ? product * factor[b] * slope[b] : 0) + (affine ? turned : 0));
+        }
+      }
+    }
+    Average<T> made = {e.stencils(false), {values.get(), gradients.get(), d}, least.get(), whole.get(), means.get(),
+                       sums.get(), nullptr, nullptr, n, d + 1};
+    average(*pools[0], sh.batch, made);
+    Expected expected(means.size, 1e-30);
+    for (int64_t i = 0; i < means.size; ++i) {
+      expected.add(i, means[i], 100 * (1 + std::abs(means[i])));
+    }
+    const P2G<T> task = {e.stencils(false), least.get(), slope.get(), factor.get(), mass.get(), x.get(),
+                         affine ? C.get() : nullptr, pushed ? A.get() : nullptr, factored ? B.get() : nullptr,
+                         whole.get(), means.get(), sums.get(), nullptr, nullptr, n, d + 1};
+    by_all(pools, "a P2G", [&](const Pool& pool) { p2g(pool, sh.batch, task); }, whole, means);
+    compare("P2G", sh, means, expected);
+  }
+  const Array<T> value(x.size), gradient(A.size);
+  const Gather<T> gathered = {e.stencils(false), e.moved.get(), value.get(), gradient.get(), n, d};
+  gather(*pools[0], sh.batch, gathered);
+  Expected moved(x.size), strained(A.size);
+  for (int64_t i = 0; i < x.size; ++i) {
+    const double change = double(factor[i / (d * p)]) * value[i];
+    moved.add(i, x[i] + change, std::abs(double(x[i])) + std::abs(change));
+  }
+  for (int64_t i = 0; i < A.size; ++i) {
+    const int64_t b = i / (m * p), row = i / p % m, k = i % p;
+    const auto at = [&](const Array<T>& a, int64_t row) { return double(a[(b * m + row) * p + k]); };
+    double change = 0, scale = std::abs(double(A[i]));
+    for (int l = 0; l < d; ++l) {
+      const double term = double(factor[b]) * slope[b] * at(gradient, d * l + row / d) * at(A, d * l + row % d);
+      change += term, scale += std::abs(term);
+    }
+    strained.add(i, A[i] + change, scale);
+  }
+  by_all(pools, "a G2P", [&](const Pool& pool) {
+    const Array<T> place(x), F(A);  // in place
+    const G2P<T> task = {e.stencils(false), e.moved.get(), slope.get(), factor.get(), place.get(), F.get(), value.get(),
+                         gradient.get(), place.get(), F.get(), n, d};
+    g2p(pool, sh.batch, task);
+    compare("x by G2P", sh, place, moved), compare("F by G2P", sh, F, strained);
+  }, value, gradient);
+}
+
 // A resistance, against the gather, the product and the scatter one after the other.
 template <class T>
 void check_resistance(const Example<T>& e, const std::vector<const Pool*>& pools) {
@@ -315,6 +386,7 @@ int check_all(const std::vector<const Pool*>& pools) {
     check(e, pools);
     if (e.shape.columns > 1) check_average(e, pools);
     check_resistance(e, pools);
+    if (e.shape.columns == e.shape.d) check_moves(e, random, pools);
     ++examples;
   };
   const auto check_both = [&](const Shape& shape, int oddity) { check_one(Example<T>(shape, oddity, random)); };

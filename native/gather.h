@@ -11,6 +11,7 @@
 
 namespace {
 
+using mpmjax::G2P;
 using mpmjax::Gather;
 using mpmjax::Pull;
 
@@ -245,6 +246,42 @@ void gather_columns(const Gather<T>& task, int64_t first, int64_t last) {
           put<d>(lanes, nodes.gather(), c, nodes.used, task.columns, task.value, task.gradients, pass > 0);
         }
       }
+    }
+  }
+}
+
+template <class T, int d, int s>
+void g2p(const G2P<T>& task, int64_t first, int64_t last) {
+  const T slope = task.slope[0], dt = task.dt[0];
+  for (int64_t start = first; start < last; start += kBlock) {
+    const int count = smaller(last - start, kBlock);
+    Block<T, d, s> block;
+    block.find_range(task.stencils, start, count);
+    block.evaluate(task.stencils, start, count);
+    for (int q = 0; q < count; q += kSimdLanes<T>) {
+      const Nodes<T, d, s, d> nodes(block, q, task.nodes, task.size, d, 0);
+      const auto sums = nodes.gather();
+      const ParticleLanes<T> lanes(start + q, last, task.stencils.particles);
+      by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
+        Simd<T> gradient[d][d];
+        for (int r = 0; r < d; ++r) {
+          lanes.template store<all>(task.value, r, sums.value[r]);
+          lanes.template store<all>(task.moved, r, lanes.template load<all>(task.x, r) + dt * sums.value[r]);
+          for (int b = 0; b < d; ++b) {
+            gradient[r][b] = slope * sums.gradients[b][r];
+            lanes.template store<all>(task.gradient, d * r + b, gradient[r][b]);
+          }
+        }
+        for (int c = 0; c < d && task.F != nullptr; ++c) {
+          Simd<T> column[d];
+          for (int k = 0; k < d; ++k) column[k] = lanes.template load<all>(task.F, d * k + c);
+          for (int r = 0; r < d; ++r) {
+            Simd<T> change = {};
+            for (int k = 0; k < d; ++k) change += gradient[r][k] * column[k];
+            lanes.template store<all>(task.strained, d * r + c, column[r] + dt * change);
+          }
+        }
+      });
     }
   }
 }

@@ -10,6 +10,26 @@
 namespace mpmjax {
 namespace {
 
+// Which of C, A and B there are say the attributes `affine`, `pushed` and `factored`.
+template <class T>
+void call_p2g(const Pool& pool, Call& call) {
+  const bool affine = call.flag("affine"), pushed = call.flag("pushed"), factored = call.flag("factored");
+  auto task = sum_of<P2G<T>>(call, call.operands + 2);
+  call.expect(task.columns == task.stencils.basis.d + 1, "nodes of another dimension");
+  const std::initializer_list<bool> present = {true, true, false, true, true, true, true, true, affine, pushed, factored};
+  if (call.read(task, 7 + affine + pushed + factored, 3, present)) p2g(pool, call.batch, task);
+}
+
+template <class T>
+void call_g2p(const Pool& pool, Call& call) {
+  const bool strained = call.operands > 6;
+  auto task = sum_of<G2P<T>>(call, 2);
+  call.expect(task.columns == task.stencils.basis.d, "a velocity of another dimension");
+  if (call.read(task, 6 + strained, 3 + strained, {true, true, false, true, true, true, true, strained})) {
+    g2p(pool, call.batch, task);
+  }
+}
+
 template <class T>
 void call_solve(const Pool& pool, Call& call) {
   Solve<T> task = {};
@@ -96,6 +116,8 @@ MPMJAX_HANDLERS(gather, 2, 1)
 MPMJAX_HANDLERS(scatter, 2, 1)
 MPMJAX_HANDLERS(average, 2, 1)
 MPMJAX_HANDLERS(pull, 2, 1)
+MPMJAX_HANDLERS(p2g, 2, 1)
+MPMJAX_HANDLERS(g2p, 2, 1)
 MPMJAX_HANDLERS(resist, 2, 1)
 MPMJAX_HANDLERS(solve, 2, 1)
 MPMJAX_HANDLERS(combine, 1, 0)

@@ -14,7 +14,8 @@ using mpmjax::Kernels;
 
 template <class T, int d, int s>
 constexpr Kernels<T> sums_of = {gather<T, d, s>, scatter<T, d, s>, average<T, d, s>,         find_ranges<T, d, s>,
-                                pull<T, d, s>,   resist<T, d, s>,  resist_particles<T, d, s>};
+                                pull<T, d, s>,   resist<T, d, s>,  resist_particles<T, d, s>,
+                                p2g<T, d, s>,    g2p<T, d, s>};
 
 template <class T>
 const Kernels<T>* sums(int d, int s) {

@@ -25,6 +25,10 @@ void scatter(const Pool& pool, int64_t batch, const Scatter<T>& first);
 template <class T>
 void average(const Pool& pool, int64_t batch, const Average<T>& first);
 template <class T>
+void p2g(const Pool& pool, int64_t batch, const P2G<T>& first);
+template <class T>
+void g2p(const Pool& pool, int64_t batch, const G2P<T>& first);
+template <class T>
 void pull(const Pool& pool, int64_t batch, const Pull<T>& first);
 // The division of a resistance, which its particles' places alone decide, and the resistance with one found before.
 template <class T>
@@ -52,7 +56,7 @@ template <class T>
 void rearrange(const Pool& pool, int64_t batch, const Rearrangement<T>& first);
 
 // The sums for one dimension and kernel. Those of d and d + 1 columns, vectors at the nodes without and with a mass,
-// have code of their own, as has a gather of one; others are summed in four columns at a time. Gather and pull take
+// have code of their own, as has a gather of one; others are summed in four columns at a time. Gather, pull and g2p take
 // particles from a first to a last. Others take all particles, and set the nodes from a first to a last; they pass over
 // blocks whose range of indices says that they give nothing to these. `resist_particles` stores what the particles from
 // a first to a last give.
@@ -61,10 +65,13 @@ struct Kernels {
   void (*gather)(const Gather<T>&, int64_t first, int64_t last);
   void (*scatter)(const Scatter<T>&, int64_t first, int64_t last);
   void (*average)(const Average<T>&, int64_t first, int64_t last);
-  void (*find_ranges)(const Stencils<T>&, int64_t first_block, int64_t last_block, Range* ranges);
+  void (*find_ranges)(const Stencils<T>&, int64_t first_block, int64_t last_block, Range* ranges, int64_t size,
+                      bool* reached);
   void (*pull)(const Pull<T>&, int64_t first, int64_t last);
   void (*resist)(const Resist<T>&, int64_t first, int64_t last);
   void (*resist_particles)(const Resist<T>&, int64_t first, int64_t last);
+  void (*p2g)(const P2G<T>&, int64_t first, int64_t last);
+  void (*g2p)(const G2P<T>&, int64_t first, int64_t last);
 };
 
 // All kernels for numbers of one type. Decompositions are of particles' matrices from a first to a last; passes over

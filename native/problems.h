@@ -108,7 +108,7 @@ struct Scatter {
   ParticleValues<T> values;
   T* nodes;
   const Range* ranges;  // of each block, or null
-  bool* reached;        // false, for each block of kChunk nodes; or null, where nodes are few
+  const bool* reached;  // which blocks of kChunk nodes particles reach; or null, where nodes are few
   int64_t size;
   int64_t columns;
   const bool* wanted;  // which blocks of kChunk numbers are, null for all; others may become anything
@@ -130,7 +130,7 @@ struct Average {
   T* means;             // the others divided by it
   T* sums;              // memory to work in
   const Range* ranges;  // as in a scatter, and so the next
-  bool* reached;
+  const bool* reached;
   int64_t size;
   int64_t columns;
 
@@ -138,6 +138,53 @@ struct Average {
   void arrays(const F& f) {
     stencils.arrays(f), f(least, {}), values.arrays(f, stencils.basis.d, columns, stencils.particles);
     f(whole, {size}), f(means, {size, columns - 1}), f(sums, {size, columns}), f(reached, {blocks_of(size)});
+  }
+};
+
+// An average of what particles have: of v, weighted with their mass, and the gradients a_b = m C_b D_b + factor (A Bᵀ)_b
+// in spacings, with the moment D of the weights. C or A may be null, and B where it is the identity.
+template <class T>
+struct P2G {
+  Stencils<T> stencils;
+  const T* least;
+  const T* slope;   // 1/dx
+  const T* factor;
+  const T *mass, *v;
+  const T *C, *A, *B;   // of each particle d rows of d
+  T *whole, *means, *sums;  // as in an average, and so the next
+  const Range* ranges;
+  const bool* reached;
+  int64_t size;
+  int64_t columns;  // d + 1
+
+  template <class F>
+  void arrays(const F& f) {
+    const int64_t d = stencils.basis.d, p = stencils.particles;
+    stencils.arrays(f), f(least, {}), f(slope, {}), f(factor, {}), f(mass, {p}), f(v, {d, p});
+    f(C, {d, d, p}), f(A, {d, d, p}), f(B, {d, d, p});
+    f(whole, {size}), f(means, {size, d}), f(sums, {size, columns}), f(reached, {blocks_of(size)});
+  }
+};
+
+// A gather of a velocity, and the particles moved by it: x + Δt v, and F + Δt (∇v) F where there is an F. Results may lie
+// where x and F do.
+template <class T>
+struct G2P {
+  Stencils<T> stencils;
+  const T* nodes;
+  const T* slope;  // 1/dx
+  const T* dt;
+  const T *x, *F;
+  T *value, *gradient;  // v and ∇v, the derivative's direction last
+  T *moved, *strained;
+  int64_t size;
+  int64_t columns;  // d
+
+  template <class Visit>
+  void arrays(const Visit& f) {
+    const int64_t d = stencils.basis.d, p = stencils.particles;
+    stencils.arrays(f), f(nodes, {size, d}), f(slope, {}), f(dt, {}), f(x, {d, p}), f(F, {d, d, p});
+    f(value, {d, p}), f(gradient, {d, d, p}), f(moved, {d, p}), f(strained, {d, d, p});
   }
 };
 

@@ -8,6 +8,9 @@
 #include <utility>
 
 #include "vector.h"
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
 
 namespace {
 
@@ -29,7 +32,7 @@ struct Row {
 
   using Part = typename VectorOf<T, lanes>::type;
   using Mask = LanesOf<T, lanes>;
-  // Four numbers, read with as many of those that follow them as a part has.
+  // Four numbers, and as many others as a part has.
   using Four = typename VectorOf<T, (lanes > kLanes ? lanes : kLanes)>::type;
   Part parts[count];
 
@@ -99,10 +102,24 @@ constexpr auto columns_of(std::integer_sequence<int, lane...>) {
   return std::integer_sequence<int, (lane < R::together * R::columns ? lane % R::columns : -1)...>();
 }
 
+// Four numbers as the first of a wider vector. They were stored as four, and a processor waits for the stores where more
+// is read than one of them wrote.
+template <class Wide, class Four>
+MPMJAX_INLINE Wide widened(const Four& four) {
+#if defined(__AVX512F__)
+  if constexpr (sizeof(Wide) == 64 && sizeof(four[0]) == 4) return (Wide)_mm512_castps128_ps512((__m128)four);
+  if constexpr (sizeof(Wide) == 64 && sizeof(four[0]) == 8) return (Wide)_mm512_castpd256_pd512((__m256d)four);
+#endif
+#if defined(__AVX2__)
+  if constexpr (sizeof(Wide) == 32 && sizeof(four[0]) == 4) return (Wide)_mm256_castps128_ps256((__m128)four);
+#endif
+  return load_as<Wide>(&four);
+}
+
 // A row that has at each node its own of four numbers, in all columns.
 template <class R, class Four>
 MPMJAX_INLINE R by_node(const Four& first) {
-  const auto four = load_as<typename R::Four>(&first);
+  const auto four = widened<typename R::Four>(first);
   return R::of([&](auto k) MPMJAX_INLINE_LAMBDA {
     return shuffled<typename R::Part>(four, nodes_of<R, decltype(k)::value>(Count<R::lanes>()));
   });
@@ -111,7 +128,7 @@ MPMJAX_INLINE R by_node(const Four& first) {
 // A row that has the same columns at each node.
 template <class R, class Four>
 MPMJAX_INLINE R at_each(const Four& first) {
-  const auto part = shuffled<typename R::Part>(load_as<typename R::Four>(&first), columns_of<R>(Count<R::lanes>()));
+  const auto part = shuffled<typename R::Part>(widened<typename R::Four>(first), columns_of<R>(Count<R::lanes>()));
   return R::of([&](int) MPMJAX_INLINE_LAMBDA { return part; });
 }
 

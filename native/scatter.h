@@ -17,6 +17,7 @@ namespace {
 
 using mpmjax::Average;
 using mpmjax::kChunk;
+using mpmjax::P2G;
 using mpmjax::Range;
 using mpmjax::Scatter;
 
@@ -72,23 +73,19 @@ MPMJAX_INLINE Range range_of(const int32_t* least, const int32_t* most, int coun
   return range;
 }
 
-// Marks the blocks of kChunk nodes, of a range from a first to before a last, that particles reach. Those of a block
-// of particles reach, for each index of the first axis, from the least to the most that the axes after it add.
+// Marks the blocks of kChunk nodes that a block of particles reaches: for each index of the first axis, from the least to
+// the most that the axes after it add. Several threads mark at a time.
 template <class T, int d, int s>
-void mark(const Stencils<T>& stencils, const Range* ranges, bool* reached, int64_t first, int64_t last) {
-  for (int64_t start = 0; start < stencils.particles; start += kBlock) {
-    const Range range = ranges[start / kBlock];
-    if (range.most < first || range.least >= last) continue;
-    const int count = smaller(stencils.particles - start, kBlock);
-    Block<T, d, s> block;
-    block.find_range(stencils, start, count);
-    const Range beyond = range_of(block.least_beyond, block.most_beyond, count);
-    for (int i = 0; i < s; ++i) {
-      for (int q = 0; q < count; ++q) {
-        const int64_t term = block.index[0][i][q];
-        if (q > 0 && term == block.index[0][i][q - 1]) continue;
-        const int64_t from = std::max(term + beyond.least, first), to = std::min(term + beyond.most, last - 1);
-        for (int64_t k = from / kChunk; from <= to && k <= to / kChunk; ++k) reached[k] = true;
+void mark(const Block<T, d, s>& block, int count, int64_t size, bool* reached) {
+  const Range beyond = range_of(block.least_beyond, block.most_beyond, count);
+  for (int i = 0; i < s; ++i) {
+    const BlockInt terms = load_as<BlockInt>(block.index[0][i]);
+    const int some = any(terms ^ terms[0]) ? count : 1;
+    for (int q = 0; q < some; ++q) {
+      const int64_t from = std::max<int64_t>(int64_t(terms[q]) + beyond.least, 0);
+      const int64_t to = std::min<int64_t>(int64_t(terms[q]) + beyond.most, size - 1);
+      for (int64_t k = from / kChunk; from <= to && k <= to / kChunk; ++k) {
+        __atomic_store_n(reached + k, true, __ATOMIC_RELAXED);
       }
     }
   }
@@ -223,14 +220,15 @@ struct Scatterer {
   }
 };
 
-// The ranges of all blocks from a first to a last.
+// The ranges of all blocks from a first to a last, and where there are so many nodes to mark, those that they reach.
 template <class T, int d, int s>
-void find_ranges(const Stencils<T>& stencils, int64_t first, int64_t last, Range* ranges) {
+void find_ranges(const Stencils<T>& stencils, int64_t first, int64_t last, Range* ranges, int64_t size, bool* reached) {
   for (int64_t k = first; k < last; ++k) {
     const int count = smaller(stencils.particles - k * kBlock, kBlock);
     Block<T, d, s> block;
     block.find_range(stencils, k * kBlock, count);
     ranges[k] = range_of(block.least, block.most, count);
+    if (reached != nullptr) mark<T, d, s>(block, count, size, reached);
   }
 }
 
@@ -309,7 +307,6 @@ void add_all(const Scatter<T>& task, int64_t first, int64_t last) {
 template <class T, int d, int s>
 void scatter(const Scatter<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns;
-  if (task.reached != nullptr) mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
   over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
     if (reached) {
       clear(task.nodes, task.wanted, from * columns, to * columns);
@@ -321,8 +318,8 @@ void scatter(const Scatter<T>& task, int64_t first, int64_t last) {
 }
 
 // Of nodes from a first to before a last, all columns, or where `columns` is 0 any number of them.
-template <class T, int columns>
-void divide(const Average<T>& task, int64_t first, int64_t last) {
+template <class T, int columns, class Problem>
+void divide(const Problem& task, int64_t first, int64_t last) {
   const int64_t c = columns == 0 ? task.columns : columns, others = c - 1;
   const T least = task.least[0];
   for (int64_t i = first; i < last; ++i) {
@@ -334,10 +331,10 @@ void divide(const Average<T>& task, int64_t first, int64_t last) {
   }
 }
 
-template <class T, int d, int s>
-void average(const Average<T>& task, int64_t first, int64_t last) {
+// Sets the nodes of an average, whose sums `add` adds.
+template <class T, int d, int s, class Problem, class Add>
+MPMJAX_INLINE void average_of(const Problem& task, int64_t first, int64_t last, const Add& add) {
   const int64_t columns = task.columns, others = columns - 1;
-  if (task.reached != nullptr) mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
   over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
     if (reached) {
       clear(task.sums, nullptr, from * columns, to * columns);
@@ -346,12 +343,62 @@ void average(const Average<T>& task, int64_t first, int64_t last) {
       wipe(task.means, task.size * others, from * others, to * others);
     }
   });
-  const Scatter<T> sums = {task.stencils, task.values, task.sums, task.ranges, nullptr, task.size, columns, nullptr};
-  add_all<T, d, s>(sums, first, last);
+  add();
   over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
     if (!reached) return;
-    if (columns == 4) return divide<T, 4>(task, from, to);
-    columns == 3 ? divide<T, 3>(task, from, to) : divide<T, 0>(task, from, to);
+    if (columns == d + 1) return divide<T, d + 1>(task, from, to);
+    divide<T, 0>(task, from, to);
+  });
+}
+
+template <class T, int d, int s>
+void average(const Average<T>& task, int64_t first, int64_t last) {
+  const Scatter<T> sums = {task.stencils, task.values, task.sums, task.ranges, nullptr, task.size, task.columns, nullptr};
+  average_of<T, d, s>(task, first, last, [&] { add_all<T, d, s>(sums, first, last); });
+}
+
+template <class T, int d, int s>
+void p2g(const P2G<T>& task, int64_t first, int64_t last) {
+  using V = Simd<T>;
+  const int64_t particles = task.stencils.particles;
+  const T spacing = 1 / task.slope[0], factor = task.factor[0] * task.slope[0];
+  const auto give = [&](const auto&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
+    alignas(64) T columns[d + 1][d + 1][kBlock] = {};  // of the value, and of the gradient along each axis
+    for (int q = 0; q < count; q += kSimdLanes<T>) {
+      const ParticleLanes<T> lanes(start + q, start + count, particles);
+      by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
+        const auto read = [&](const T* array, int row) MPMJAX_INLINE_LAMBDA {
+          prefetch(array + row * particles + start + q);
+          return lanes.template load<all>(array, row);
+        };
+        const V m = read(task.mass, 0);
+        for (int r = 0; r < d; ++r) store(columns[0][r] + q, m * read(task.v, r));
+        store(columns[0][d] + q, m);
+        V A[d][d] = {}, B[d][d] = {}, C[d][d] = {};
+        for (int r = 0; r < d; ++r) {
+          for (int b = 0; b < d; ++b) {
+            if (task.C != nullptr) C[r][b] = m * read(task.C, d * r + b);
+            if (task.A != nullptr) A[r][b] = factor * read(task.A, d * r + b);
+            if (task.B != nullptr) B[r][b] = read(task.B, d * r + b);
+          }
+        }
+        for (int b = 0; b < d; ++b) {
+          V moment = V{} + (s == 3 ? T(1) / 4 : T(1) / 3);
+          if (s == 2) moment = T(0.25) - read(task.stencils.offset, b) * read(task.stencils.offset, b);
+          for (int r = 0; r < d; ++r) {
+            V sum = spacing * moment * C[r][b];
+            if (task.A != nullptr && task.B == nullptr) sum += A[r][b];
+            for (int k = 0; k < d && task.B != nullptr; ++k) sum += A[r][k] * B[b][k];
+            store(columns[b + 1][r] + q, sum);
+          }
+        }
+      });
+    }
+    for (int b = 0; b <= d; ++b) to_rows<T, d + 1>(columns[b], rows[b]);
+  };
+  average_of<T, d, s>(task, first, last, [&] {
+    const NodeSums<T, s, d + 1> nodes(task.sums, d + 1, 0, first, last);
+    add_blocks<T, d, s, true, d + 1>(task.stencils, task.ranges, nodes, give);
   });
 }
 

@@ -84,17 +84,20 @@ double reached(const Division& by) {
   return by.ranges.empty() ? 1 : double(count) / by.ranges.size();
 }
 
+// With `reached` the nodes are marked that particles reach, a block of kChunk each.
 template <class T, class Problem>
-Division divide(const Pool& pool, int64_t batch, const Problem& all, const Kernels<T>& kernels, bool wanted = false) {
+Division divide(const Pool& pool, int64_t batch, const Problem& all, const Kernels<T>& kernels,
+                bool* reached = nullptr) {
   const int64_t blocks = blocks_of(all.stencils.particles, kBlock), parts = shares(pool, batch, all, 1);
   Division result = {parts, blocks, {}, {}};
   result.cuts.assign(batch, {0, all.size});
-  if (parts == 1 && !wanted) return result;
+  if (parts == 1 && reached == nullptr) return result;
   result.ranges.resize(batch * blocks);
   share_parts(pool, batch, blocks, std::max<int64_t>(1, blocks_of(blocks, parts)),
               [&](int64_t m, int64_t first, int64_t last) {
     const Problem one = member(all, m);
-    kernels.find_ranges(one.stencils, first, last, result.ranges.data() + m * blocks);
+    bool* marks = reached == nullptr ? nullptr : reached + m * blocks_of(all.size);
+    kernels.find_ranges(one.stencils, first, last, result.ranges.data() + m * blocks, all.size, marks);
     if (first == 0) result.cuts[m] = cut(one.stencils, all.size, parts);
   });
   return result;
@@ -108,7 +111,7 @@ void set_nodes(const Pool& pool, int64_t batch, Problem all, const Kernels<T>& k
   const bool large = all.size * all.columns * static_cast<int64_t>(sizeof(T)) > kCached;
   const std::unique_ptr<bool[]> reached(large ? new bool[batch * blocks_of(all.size)]() : nullptr);
   all.reached = reached.get();
-  over_nodes(pool, batch, all, divide(pool, batch, all, kernels, large), run);
+  over_nodes(pool, batch, all, divide(pool, batch, all, kernels, reached.get()), run);
 }
 
 template <class T, template <class> class Problem>
@@ -139,6 +142,16 @@ void average(const Pool& pool, int64_t batch, const Average<T>& all) {
 }
 
 template <class T>
+void p2g(const Pool& pool, int64_t batch, const P2G<T>& all) {
+  set_nodes(pool, batch, all, kernels_of(all), kernels_of(all).p2g);
+}
+
+template <class T>
+void g2p(const Pool& pool, int64_t batch, const G2P<T>& all) {
+  over_particles(pool, batch, all, kernels_of(all).g2p);
+}
+
+template <class T>
 Division divided(const Pool& pool, int64_t batch, const Resist<T>& all) {
   return divide(pool, batch, all, kernels_of(all));
 }
@@ -160,6 +173,8 @@ void resist(const Pool& pool, int64_t batch, const Resist<T>& all, const Divisio
   template void gather(const Pool&, int64_t, const Gather<T>&);         \
   template void scatter(const Pool&, int64_t, const Scatter<T>&);       \
   template void average(const Pool&, int64_t, const Average<T>&);       \
+  template void p2g(const Pool&, int64_t, const P2G<T>&);               \
+  template void g2p(const Pool&, int64_t, const G2P<T>&);               \
   template void pull(const Pool&, int64_t, const Pull<T>&);             \
   template Division divided(const Pool&, int64_t, const Resist<T>&);    \
   template void resist(const Pool&, int64_t, const Resist<T>&, const Division&);

@@ -65,10 +65,10 @@ def name_of(equation):
 
 
 def inner_programs(equation):
-    """The programs in an equation's parameters, of a function with a derivative rule, or of a solve; not of kernels."""
+    """The programs in an equation's parameters: of a function with a rule, a transfer or a solve; not of sums."""
     call = equation.params.get("call")
     if isinstance(call, _Call):
-        if call.function.kernel in (None, "solve"):
+        if call.function.kernel in (None, "p2g", "g2p", "solve"):
             yield jax.make_jaxpr(partial(_values, call=call))(*(a.aval for a in equation.invars)).jaxpr
         return
     for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda a: hasattr(a, "eqns")):

@@ -16,7 +16,7 @@ import pytest
 from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 
 import mpmjax as mpm
-from mpmjax.discretisation import Stencil, _fused_sums, _sums as sums, basis_attributes, make_stencil
+from mpmjax.discretisation import Stencil, _fused_sums, _sums as sums, _transfer, basis_attributes, make_stencil
 from mpmjax.discretisation._stencil import basis_of
 from mpmjax.discretisation._sums import Group
 from mpmjax.implicit import ImplicitOperator, ParticleStiffness, Projection, _solver as solver
@@ -242,6 +242,35 @@ def test_resistances_agree(d, dtype):
     both = jnp.stack([u, resistance(d, 45, dtype, seed=7)[-1]])
     together = jax.jit(jax.vmap(resisted, in_axes=(None, None, None, 0)))(*rest, both)
     np.testing.assert_array_equal(together, jnp.stack([run(*rest, one) for one in both]))
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
+@pytest.mark.parametrize(("d", "order"), [(3, 2), *thorough((1, 1), (2, 1), (2, 3))])
+def test_transfers_agree(d, order, dtype, choose):
+    """P2G with each of its terms, and G2P with an F and without: one call each, also of a batch, with derivatives."""
+    rng = np.random.default_rng(0)
+    numbers = [jnp.asarray(rng.normal(size=shape), dtype) for shape in ((d, 45), *[(d, d, 45)] * 3, (SIDE**d, d))]
+    grid, place = mpm.Grid((SIDE,) * d, 0.7), jnp.asarray(rng.uniform(1.5, 2.5, (d, 45)), dtype)
+    window, scale = jnp.zeros(d, "int32"), jnp.asarray(0.3, dtype)
+
+    def moved(place, v, A, B, C, nodes):
+        stencil = make_stencil(mpm.BSpline(order), mpm.MLSGradient(), grid, window, place.T)
+        mass, params = 1 + v[0] ** 2, {"basis": stencil.basis, "size": grid.size}
+        terms = (C, (scale, A, B)), (None, (scale, A, None)), (C, None)
+        sums = [_transfer.p2g_sum(stencil, 1e-3 * scale, mass, v, *some, **params) for some in terms]
+        return sums, [_transfer.g2p_sum(stencil, nodes, scale, v, F, basis=stencil.basis) for F in (A, None)]
+
+    args = (place, *numbers)
+    along = tuple(jnp.cos(3 * a) for a in args)
+    agree(*by_each(choose, moved, *args), dtype)
+    agree(*by_each(choose, lambda *args: jax.jvp(moved, args, along)[1], *args), dtype, roundings=1000)
+    pairs = [jnp.stack([a, a[..., ::-1]]) for a in args]
+    found, expected = by_each(choose, jax.vmap(moved), *pairs)
+    agree(found, expected, dtype)
+    choose("native")
+    text = jax.jit(lambda *args: moved(*args)).lower(*args).as_text()
+    assert [text.count(f"@mpmjax_{kernel}(") for kernel in ("p2g", "g2p", "gather", "average")] == [3, 2, 0, 0]
 
 
 @NEEDS_LIBRARY

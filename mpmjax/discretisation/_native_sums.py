@@ -127,3 +127,30 @@ def call_average(
     shapes = (size,), (size, columns - 1), (size, columns)  # the last one holds the sums before they are divided
     results = [jax.ShapeDtypeStruct(shape, t.dtype) for shape in shapes]
     return call([first, t, least, *amounts], basis_attributes(basis), results=results)[:2]
+
+
+def call_p2g(
+    call: Call, stencil: Any, least: Array, mass: Array, v: Array, C: Any, impulse: Any, *, basis: Basis, size: int
+) -> list[Array] | None:
+    """`p2g_sum`, but for stencils with gradients of their own or without any."""
+    if stencil.own_derivatives is not None or stencil.flat is not None or (C is None and impulse is None):
+        return None
+    factor, *factors = (jnp.zeros_like(least), None, None) if impulse is None else impulse
+    operands = [stencil.first, stencil.offset, least, stencil.slope, factor, mass, v, C, *factors]
+    told = dict(zip(("affine", "pushed", "factored"), (a is not None for a in operands[-3:]), strict=True))
+    d = v.shape[-2]
+    shapes = (size,), (size, d), (size, d + 1)  # the last one holds the sums before they are divided
+    results = [jax.ShapeDtypeStruct(shape, v.dtype) for shape in shapes]
+    return call([a for a in operands if a is not None], basis_attributes(basis) | told, results=results)[:2]
+
+
+def call_g2p(
+    call: Call, stencil: Any, nodes: Array, dt: Array, x: Array, F: Any, *, basis: Basis
+) -> list[Array] | None:
+    """`g2p_sum`, but for stencils with gradients of their own or without any. Particles are moved in place."""
+    if stencil.own_derivatives is not None or stencil.flat is not None:
+        return None
+    operands, aliases = [stencil.first, stencil.offset, nodes, stencil.slope, dt, x], {5: 2}
+    if F is not None:
+        operands, aliases = [*operands, F], {5: 2, 6: 3}
+    return call(operands, basis_attributes(basis), aliases=aliases)

@@ -3,17 +3,21 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import ClassVar, NamedTuple
+from functools import partial, reduce
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
+from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import require_between, require_fields
 from mpmjax.discretisation._fused_sums import average
 from mpmjax.discretisation._grid import Grid
-from mpmjax.discretisation._stencil import Stencil
+from mpmjax.discretisation._native_sums import call_g2p, call_p2g
+from mpmjax.discretisation._stencil import Basis, Stencil
 from mpmjax.discretisation._sums import gather, scatter
 
 
@@ -39,6 +43,10 @@ class ParticleMotion(NamedTuple):
     """Their new C [1/s], shape (d, d, p); None if they keep none."""
     gradient: Matrix
     """The velocity gradient that deforms them, Σ_i v̄_i g_ipᵀ [1/s], shape (d, d, p)."""
+    x: Float[Array, "d p"]
+    """Their new positions [m], shape (d, p)."""
+    F: Matrix | None
+    """Their new deformation gradient [-], shape (d, d, p); None unless they were given one."""
 
 
 class AbstractTransfer(eqx.Module):
@@ -174,13 +182,17 @@ def without_empty(
     return replace(stencil, flat=reads[:, 0])
 
 
+Impulse = tuple[Scalar, Matrix, Matrix | None]
+"""Factors c, A and B of a matrix c A Bᵀ for each particle; B is None for the identity."""
+
+
 def p2g(
     stencil: Stencil,
     mass: Float[Array, "p"],
     v: Float[Array, "d p"],
     C: Matrix | None,
     size: int,
-    impulse: Matrix | None = None,
+    impulse: Impulse | None = None,
 ) -> tuple[NodeScalar, NodeVector]:
     """Particles to grid: m_i = Σ_p w_ip m_p and m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)).
 
@@ -193,32 +205,72 @@ def p2g(
         v: v_p [m/s], shape (d, p).
         C: affine velocity [1/s], shape (d, d, p), or None.
         size: number of nodes.
-        impulse: I_p [kg m²/s], shape (d, d, p), to add Σ_p I_p g_ip to the momentum in the same sum. g_ip is the
-            moving-least-squares gradient if there is a C.
+        impulse: factors of I_p = c A_p B_pᵀ [kg m²/s], c a number, A and B of shape (d, d, p), to add Σ_p I_p g_ip to
+            the momentum in the same sum. g_ip is the moving-least-squares gradient if there is a C.
 
     Returns:
         mass m_i [kg], shape (n,), and velocity v_i [m/s], shape (n, d); both are zero on empty nodes.
     """
-    gradient_terms = [] if impulse is None else [impulse]
-    if C is None:
-        used = stencil
-    else:  # w (x_i − x_p) = D g, with g the moving-least-squares gradient
-        used = stencil.least_squares
-        gradient_terms.append(mass * C * stencil.moment)
-    gradients = jnp.swapaxes(sum(gradient_terms), 0, 1) if gradient_terms else None
-    rows = mass * v, gradients, jnp.finfo(mass.dtype).eps * mass.min()
-    return average(used, mass, *rows, size)
+    used, least = stencil if C is None else stencil.least_squares, jnp.finfo(mass.dtype).eps * mass.min()
+    return p2g_sum(used, least, mass, v, C, impulse, basis=used.basis, size=size)
+
+
+@partial(
+    custom_derivative,
+    kernel="p2g",
+    results=lambda _, least, mass, v, *__, size, **___: tuple(
+        jax.ShapeDtypeStruct(shape, v.dtype) for shape in ((size,), (size, len(v)))
+    ),
+    call=call_p2g,
+)
+def p2g_sum(
+    stencil: Stencil, least: Array, mass: Array, v: Array, C: Matrix | None, impulse: Impulse | None, **params: Any
+) -> tuple[Array, Array]:
+    """`p2g` for a stencil whose gradients are those of both C and impulse."""
+    terms = []
+    if impulse is not None:
+        factor, A, B = impulse
+        terms.append(factor * (A if B is None else la.matmul(A, la.transpose(B))))
+    if C is not None:  # w (x_i − x_p) = D g, with g the moving-least-squares gradient
+        terms.append(mass * C * stencil.moment)
+    gradients = la.transpose(reduce(jnp.add, terms)) if terms else None
+    return average(stencil, mass, mass * v, gradients, least, params["size"])
+
+
+p2g_sum.differentiated_as_written()
+
+
+@partial(
+    custom_derivative,
+    kernel="g2p",
+    results=lambda _, nodes, dt, x, F, **__: (x, jax.ShapeDtypeStruct((len(x), *x.shape), x.dtype), x, F),
+    call=call_g2p,
+)
+def g2p_sum(
+    stencil: Stencil, nodes: NodeVector, dt: Scalar, x: Float[Array, "d p"], F: Matrix | None, *, basis: Basis
+) -> tuple[Float[Array, "d p"], Matrix, Float[Array, "d p"], Matrix | None]:
+    """A velocity v of the nodes at the particles, its gradient, x + Δt v and F + Δt (∇v) F."""
+    del basis  # of the stencil, for back ends
+    value, slopes = gather(stencil, nodes, saved=True)
+    gradient = la.transpose(slopes)
+    return value, gradient, x + dt * value, None if F is None else F + dt * la.matmul(gradient, F)
+
+
+g2p_sum.differentiated_as_written()
 
 
 def g2p(
     transfer: AbstractTransfer,
     stencil: Stencil,
+    dt: Scalar,
+    x: Float[Array, "d p"],
     v: Float[Array, "d p"],
     before: NodeVector | None,
     after: NodeVector,
     mean: NodeVector | None = None,
     *,
     C: Matrix | None = None,
+    F: Matrix | None = None,
     keep_gradient: bool = False,
 ) -> ParticleMotion:
     """Grid to particles.
@@ -226,12 +278,15 @@ def g2p(
     Args:
         transfer: the transfer.
         stencil: stencil of the particles.
+        dt: Δt [s].
+        x: the particles' positions [m], shape (d, p).
         v: the particles' velocity before the step [m/s], shape (d, p).
         before: v_i^n with the prescribed values where a boundary holds [m/s], shape (n, d); needed by transfers with
             `needs_change` only.
         after: v_i^{n+1} [m/s], shape (n, d).
         mean: the velocity v̄_i with which positions and deformation move [m/s], shape (n, d). Default: v_i^{n+1}.
         C: the particles' affine velocity before the step [1/s], shape (d, d, p), if they have one.
+        F: their deformation gradient [-], shape (d, d, p), if it is to be strained in the same pass.
         keep_gradient: whether transfers that are not affine return a C too, Σ_i v_i^{n+1} g_ipᵀ.
     """
     change = None
@@ -239,22 +294,22 @@ def g2p(
         if before is None:
             raise ValueError(f"{type(transfer).__name__} needs the change of the nodes' velocity: give before.")
         change = after - before
-    fields = [field for field in (after, mean, change) if field is not None]
-    # Each by itself: what computes has code of its own for as many columns as there are axes. A gradient is (d, d, p),
-    # the derivative's direction last.
-    values, slopes = zip(*(gather(stencil, field, saved=True) for field in fields), strict=True)
-    gradients = [jnp.swapaxes(slope, 0, 1) for slope in slopes]
+    moving, fields = after if mean is None else mean, [field for field in (after, change) if field is not None]
+    carrier, gradient, x, F = g2p_sum(stencil, moving, jnp.asarray(dt), x, F, basis=stencil.basis)
+    # Each by itself: what computes has code of its own for as many columns as there are axes.
+    seen = []
+    for field in fields:
+        if field is moving:
+            seen.append((carrier, gradient))
+        else:
+            value, slopes = gather(stencil, field, saved=True)
+            seen.append((value, la.transpose(slopes)))
     affine: list[Matrix | None] = [None] * len(fields)
     if transfer.affine and stencil.is_least_squares:
-        affine = [*gradients]
+        affine = [slope for _, slope in seen]
     elif transfer.affine:
-        ends = [field for field in (after, change) if field is not None]
-        _, slopes = gather(stencil.least_squares, jnp.concatenate(ends, axis=1), saved=True)
-        slopes = jnp.split(jnp.swapaxes(slopes, 0, 1), len(ends))
-        affine[0] = slopes[0]
-        if change is not None:
-            affine[-1] = slopes[-1]
-    seen = [Gathered(*parts) for parts in zip(values, gradients, affine, strict=True)]
-    new, carrier, changed = seen[0], seen[0 if mean is None else 1], None if change is None else seen[-1]
+        _, slopes = gather(stencil.least_squares, jnp.concatenate(fields, axis=1), saved=True)
+        affine = [*jnp.split(la.transpose(slopes), len(fields))]
+    new, changed, *_ = *(Gathered(*both, slope) for both, slope in zip(seen, affine, strict=True)), None
     C = transfer.affine_velocity(C, new, changed) if transfer.affine else new.gradient if keep_gradient else None
-    return ParticleMotion(carrier.value, transfer.velocity(v, new, changed), C, carrier.gradient)
+    return ParticleMotion(carrier, transfer.velocity(v, new, changed), C, gradient, x, F)

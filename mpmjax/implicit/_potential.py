@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector
+from mpmjax.autodiff import materialised
 from mpmjax.discretisation import Stencil
 from mpmjax.potential import AbstractTerm, Displacement, Forces, Mirror, scattered
 from mpmjax.state import MaterialPoints
@@ -89,6 +90,14 @@ class ElasticPotential(eqx.Module):
         d, each = self.stencil.strain_dim, self.material_points
         P = [points.stress(points.deformation) for points in each] if P is None else P
         return jnp.concatenate([q.weighted_stress(stress, d) for q, stress in zip(each, P, strict=True)], axis=-1)
+
+    def stress_factors(self) -> tuple[Matrix, Matrix | None]:
+        """Factors A and B of `weighted_stress` at u = 0, A Bᵀ: of one material V0 P and F, whose product a sum over
+        particles can form; B is None where they are multiplied."""
+        points, *others = self.material_points
+        if others or not points.strained_by_gradient or self.stencil.radius is not None:
+            return self.weighted_stress(), None
+        return materialised(points.volume * points.stress(points.deformation)), points.deformation
 
     @property
     def viscous(self) -> bool:

@@ -40,15 +40,13 @@ class RolloutState(eqx.Module):
     """The order of the particles in memory; None if it is that in which they were given."""
 
     def to_loop_layout(self) -> "RolloutState":
-        """The state in the layout of the loop over steps: component first, as a step has its arrays, and C with the
-        direction of the derivative before the component, as a gather has it. XLA would else transpose all of them in
-        each step."""
-        return replace(self, particles=_with_transposed_affine(jax.tree.map(components, self.particles)))
+        """The state in the layout of the loop over steps: component first, as a step has its arrays. XLA would else
+        transpose all of them in each step."""
+        return replace(self, particles=jax.tree.map(components, self.particles))
 
     def from_loop_layout(self, hold: Callable[[State], State] = lambda state: state) -> "RolloutState":
         """The state from the layout of the loop over steps, with `hold` applied to the arrays as the loop has them."""
-        state = _with_transposed_affine(hold(self.particles))
-        return replace(self, particles=jax.tree.map(particle_first, state))
+        return replace(self, particles=jax.tree.map(particle_first, hold(self.particles)))
 
     def as_given(self) -> "RolloutState":
         """A state of the loop, particle first again and in the order in which the particles were given."""
@@ -81,11 +79,6 @@ def initial_state(problem: "Problem") -> RolloutState:
     if problem.control is not None:
         state = replace(state, mass=particles.mass, volume=particles.volume)
     return RolloutState(state, colliders, boundaries, problem.memory)
-
-
-def _with_transposed_affine(state: State) -> State:
-    """A component-first state with C transposed."""
-    return state if state.C is None else eqx.tree_at(lambda s: s.C, state, jnp.swapaxes(state.C, 0, 1))
 
 
 Control = Callable[[Scene, Particles, Scalar, Scalar, Any], tuple[Scene, Particles, Any]]

@@ -130,9 +130,7 @@ def _in_order(wanted: Bool[Array, ""], order: Order, state: State) -> State:
     wanted."""
     groups = [_moved(wanted, order[rows] - rows.start, (F, history)) for rows, F, history in by_material(state)]
     deformations, histories = zip(*groups, strict=True)
-    x, v, C = _moved(wanted, order, (state.x, state.v, None if state.C is None else jnp.swapaxes(state.C, 1, 2)))
-    C = None if C is None else jnp.swapaxes(C, 1, 2)  # transposed in between, as a rollout's loop has it in memory
-    return State(x, v, C, deformations, histories)
+    return State(*_moved(wanted, order, (state.x, state.v, state.C)), deformations, histories)
 
 
 def _moved(wanted: Bool[Array, ""], order: Order, tree: Any) -> Any:

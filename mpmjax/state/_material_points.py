@@ -296,6 +296,11 @@ class MaterialPoints(eqx.Module):
         P = materialised(self.volume * P)
         return P if self.total else self.law.measure.kirchhoff_stress(P, self.deformation, dim)
 
+    @property
+    def strained_by_gradient(self) -> bool:
+        """Whether `change` is ∇u F."""
+        return not self.total and self.law.measure.axes == 2
+
     def stiffness(
         self, tangent: Callable[[Deformation], Deformation], dim: int
     ) -> tuple[Float[Array, "t q"], tuple[AbstractStiffness, ...]]:

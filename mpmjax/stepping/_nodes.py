@@ -183,10 +183,13 @@ def particles_to_grid(
     C = None if particles.C is None else components(particles.C)
     joined = joined and (stencil.is_least_squares or not scene.transfer.affine)
     potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), size)
-    flux = potential.weighted_stress()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
-    if explicit_viscosity and C is not None and potential.material_viscous:
+    A, B = potential.stress_factors()  # of the flux V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
+    viscous = explicit_viscosity and C is not None and potential.material_viscous
+    if B is not None and (viscous or not joined):
+        A, B = la.matmul(A, la.transpose(B)), None
+    if viscous:
         L = C if stencil.radius is None else in_space(stencil.radius, v, C)
-        flux = flux + potential.weighted_viscous_stress(L)
+        A = A + potential.weighted_viscous_stress(L)
     gravity, body_force = jnp.asarray(scene.gravity), None
     if scene.body_force is not None:
         x = particles.x + body_force_at * dt * particles.v if body_force_at else particles.x
@@ -194,15 +197,15 @@ def particles_to_grid(
     # one sum costs half of two, and an explicit step asks for v* alone
     if joined:
         v = v + dt * (gravity[:, None] if body_force is None else gravity[:, None] + body_force)
-    affine, impulse = C if scene.transfer.affine else None, -dt * flux if joined else None
-    if stencil.radius is not None and impulse is not None:
-        around, impulse = in_section(stencil.radius, impulse)
-        v = v + around / particles.mass
+    if stencil.radius is not None and joined:
+        around, A = in_section(stencil.radius, A)
+        v = v - dt * around / particles.mass
+    affine, impulse = C if scene.transfer.affine else None, (jnp.asarray(-dt), A, B) if joined else None
     mass, v = p2g(stencil, particles.mass, v, affine, size, impulse)
     nodes = Nodes(
         mass=mass,
         v=v,
-        f=None if joined else potential.on_nodes([Forces(slopes=-la.transpose(flux))]),
+        f=None if joined else potential.on_nodes([Forces(slopes=-la.transpose(A))]),
         g=None if joined else gravity,
         dt=jnp.asarray(dt),
         spacing=jnp.asarray(scene.grid.spacing),

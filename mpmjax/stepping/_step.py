@@ -136,26 +136,28 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
     before = new.before(nodes) if scene.transfer.needs_change else None
     if potential.mirror.images:
         before, motion = jax.tree.map(potential.mirror.unfold, (before, motion))
+    radius, points = potential.stencil.radius, potential.material_points
+    together = len(points) == 1 and points[0].strained_by_gradient and radius is None
     gathered = g2p(
         scene.transfer,
         potential.stencil,
+        dt,
+        components(particles.x),
         components(particles.v),
         before,
         motion.velocity,
         motion.mean,
         C=None if particles.C is None else components(particles.C),
+        F=points[0].deformation if together else None,
         keep_gradient=scene.keeps_gradient,
     )
-    grad_v, radius = gathered.gradient, potential.stencil.radius
-    grad_v = grad_v if radius is None else in_space(radius, gathered.carrier, grad_v)
+    grad_v = gathered.gradient if radius is None else in_space(radius, gathered.carrier, gathered.gradient)
+    F = [gathered.F] if together else [q.deformation + dt * q.change(q.rows_of(grad_v)) for q in points]
     after = State(
-        x=particle_first(components(particles.x) + dt * gathered.carrier),
+        x=particle_first(gathered.x),
         v=particle_first(gathered.velocity),
         C=None if gathered.affine is None else particle_first(gathered.affine),
-        deformations=tuple(
-            particle_first(points.deformation + dt * points.change(points.rows_of(grad_v)))
-            for points in potential.material_points
-        ),
+        deformations=tuple(map(particle_first, F)),
         histories=particles.histories,
     )
     moved = with_state(particles, after)
