@@ -138,6 +138,13 @@ FITTING = {
     mpm.fitting.Density: {"grid": SCENE.grid},
 }
 """What fits are made of, which files hold by other means."""
+GATE = mpm.HalfSpace((0.0, 0.0), (1.0, 0.0))
+FLOWS = {
+    mpm.extensions.Inlet: {"stock": PARTICLES, "velocity": (1.0, 0.0), "gate": GATE, "length": 0.1, "first": 0},
+    mpm.extensions.Outlet: {"region": GATE, "start": 0.0, "rest": (0.0, 0.0)},
+    mpm.extensions.Controls: {"parts": (reached,)},
+}
+"""What controls are made of."""
 PARTICLE_FIELDS = {"x": PARTICLES.x, "v": PARTICLES.v, "mass": PARTICLES.mass, "volume": PARTICLES.volume}
 
 
@@ -148,7 +155,7 @@ def arguments_of(value: object) -> dict:
 
 
 MADE = {type(value): arguments_of(value) for value in EXAMPLES.values()}
-CALLS = MADE | {mpm.Particles: PARTICLE_FIELDS} | FITTING | FUNCTIONS
+CALLS = MADE | {mpm.Particles: PARTICLE_FIELDS} | FITTING | FLOWS | FUNCTIONS
 NO_KIND = {
     "nonsense": "nonsense",
     "class": mpm.Scene,
@@ -210,7 +217,7 @@ MAY = {
     *(
         (call, name)
         for call in CALLS
-        for name in ("observe", "build", "curve", "parameter", "report", "progress", "say")
+        for name in ("observe", "build", "curve", "parameter", "report", "progress", "say", "control", "memory")
     ),
 }
 """Arguments that take words, or any function."""

@@ -75,6 +75,7 @@ EXAMPLES = {
     mpm.Traction: mpm.Traction(PATCH, (1.0, 2.0)),
     mpm.Couple: mpm.Couple(PATCH, 3.0),
     mpm.Rigid: mpm.Rigid(1e6, (True, False), turns=False),
+    mpm.extensions.Active: mpm.extensions.Active(mpm.NeoHookean(1e5, 0.3), 1e3, 0.1, 0.2),
     mpm.Pressure: mpm.Pressure(PATCH, mpm.TimeSeries((0.0, 1.0), (0.0, 2.0)), following=False),
     mpm.PointLoad: mpm.PointLoad(mpm.PointsAt(((0.1, 0.2), (0.3, 0.4))), (1.0, 2.0)),
     mpm.Spring: mpm.Spring(mpm.PointsAt(((0.1, 0.2),), (1.0,)), (1.0, 2.0), 3.0, GRIP.motion),

@@ -201,6 +201,10 @@ class Controls(eqx.Module):
 
     parts: tuple[Any, ...]
 
+    def __check_init__(self):
+        functions = isinstance(self.parts, tuple) and len(self.parts) > 0 and all(map(callable, self.parts))
+        require(functions, "Controls takes a tuple of functions, each a control, got something else or none.")
+
     def __call__(
         self, scene: Scene, particles: Particles, t: Scalar, dt: Scalar, memory: Any
     ) -> tuple[Scene, Particles, Any]:
