@@ -399,13 +399,16 @@ ERRORS = [
     ({"grid__spacing": -1}, "[grid]: A grid's spacing must be greater than zero, got -1.0."),
     ({"grid__follow": 1}, "[grid] follow must be true or false, got 1."),
     ({"grid__kind": "Gird"}, "[grid]: unknown kind 'Gird', did you mean 'Grid'? It must be Grid."),
-    ({"material__kind": None}, "[material] needs a kind: one of CamClay, DruckerPrager, FixedCorotated, "),
+    ({"material__kind": None}, "[material] needs a kind: one of Active, CamClay, DruckerPrager, FixedCorotated, "),
     (
         {"material__kind": "Neohookean"},
         "[material]: unknown kind 'Neohookean', did you mean 'NeoHookean'? It must be one",
     ),
-    ({"material__kind": 7}, "[material]: unknown kind 7. It must be one of CamClay, DruckerPrager, FixedCorotated, "),
-    ({"material__kind": "Box"}, "[material]: unknown kind 'Box'. It must be one of CamClay, DruckerPrager, Fi"),
+    (
+        {"material__kind": 7},
+        "[material]: unknown kind 7. It must be one of Active, CamClay, DruckerPrager, FixedCorotated, ",
+    ),
+    ({"material__kind": "Box"}, "[material]: unknown kind 'Box'. It must be one of Active, CamClay, DruckerPrager, Fi"),
     ({"material__youngs_modulu": 1}, "[material]: unknown key 'youngs_modulu', did you mean 'youngs_modulus'? Known"),
     ({"material__poisson_ratio": None}, "[material] needs the key 'poisson_ratio'."),
     (
@@ -469,7 +472,7 @@ ERRORS = [
     ({"material": [{"kind": "NeoHookean"}]}, "[[material]] 1 needs the key 'youngs_modulus'."),
     (
         {"material": [{"kind": "NeoHookean", "youngs_modulus": 1, "poisson_ratio": 0.3}, {"kind": "Snoww"}]},
-        "[[material]] 2: unknown kind 'Snoww', did you mean 'Snow'? It must be one of CamClay, DruckerPrager,",
+        "[[material]] 2: unknown kind 'Snoww', did you mean 'Snow'? It must be one of Active, CamClay, DruckerPrager,",
     ),
     ({"transfer": "PICK"}, "transfer: unknown kind 'PICK', did you mean 'PIC'? It must be one of APIC, FLIP, PIC."),
     ({"kernel": {"order": 4}}, "[kernel]: A B-spline's order must be 1, 2 or 3, got 4."),
