@@ -10,7 +10,7 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax.boundary._contact import ConstrainedNodes, constrain, count_places, friction_change, friction_share
-from mpmjax.boundary._planes import column_weight
+from mpmjax.boundary._plane_contact import column_weight
 from mpmjax.checks._values import canonical
 from mpmjax.implicit import Projection, no_solve
 from mpmjax.potential import Mirror

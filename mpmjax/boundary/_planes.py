@@ -1,6 +1,5 @@
 """Symmetry, clamp and contact planes, beyond which nodes are mirror images."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -8,18 +7,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
-from mpmjax.boundary._contact import AbstractContact, AbstractNodes, ConstrainedNodes, friction_change
+from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, Motion
-from mpmjax.potential import Image, MirrorPlace, WallImage, mirror_image, wall_image
-
-SHUT = 1e-2
-"""The gap up to which a plane holds what is before it, in spacings."""
+from mpmjax.potential import Image, MirrorPlace, mirror_image, wall_image
 
 
 class AbstractPlane(AbstractBoundary):
@@ -234,143 +230,6 @@ class ClampPlane(AbstractPlane):
         return None if motion is None or not motion.turns else motion.pivot(jnp.zeros(motion.dim), t)
 
 
-class PlaneContact(AbstractContact):
-    """A wall at right angles to an axis in the window, or two that face each other. Each column of nodes along the
-    normal is a place at each: of shape (layers, ..., 1, ..., s), the shape of the window with 1 for the axis.
-
-    Holding a column means that its nodes move by the wall's map (see `wall_image`), with normal velocities B_i v_b. The
-    normal impulse is r = Σ (1 − B_i) R_i, with R the impulses that are missing at the nodes: what they leave on b is
-    Σ B_i R_i = 0. The gap velocity is what r works on, −r of an explicit step that holds the column:
-
-        Σ m_i (1 − B_i S/M) (v_i − B_i v_b),   S = Σ B m,   M = Σ B² m,
-
-    so that the two conditions exclude each other. Columns that no particle reaches
-    whose face is at the wall are not held. Columns that are each other's image in another plane are held together.
-    Friction acts on the first node of a column that has a tangential velocity of its own.
-    """
-
-    walls: tuple[WallImage, ...]
-    """The walls' maps."""
-    inward: tuple[Array | int, ...]
-    """The component of each inward normal: +1 or −1."""
-    coefficient: Scalar | None
-    """Coulomb coefficient [-]; None without friction."""
-    shut: Bool[Array, "..."]
-    """The columns that may be held."""
-
-    @property
-    def axis(self) -> int:
-        """Direction of the normals."""
-        return self.walls[0].axis
-
-    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
-        """In explicit steps, where nothing across another axis and no other boundary moves the nodes of a column."""
-        planes = (contact for contact in nodes.contacts if isinstance(contact, PlaneContact))
-        alone = all(plane.axis == self.axis for plane in planes) and not nodes.potential.mirror.images
-        return explicit and alone and not nodes.conditions.holds
-
-    def images(self, active: Array) -> tuple[WallImage, ...]:
-        return tuple(replace(wall, held=active[..., k : k + 1]) for k, wall in enumerate(self.walls))
-
-    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> Array:
-        """The momentum with which each column leaves its wall [kg m/s]: its weights times what its velocity lacks of
-        the map's."""
-        mass, along = held.unconstrained.mass, v[:, self.axis]
-        each = [
-            inward * wall.column(column_weight(wall, mass) * (wall.rows(along) - wall.share * wall.row(along)))
-            for inward, wall in zip(self.inward, self.walls, strict=True)
-        ]
-        return self._tied(held, jnp.where(self.shut, jnp.concatenate(each, axis=-1), 0))
-
-    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Array:
-        """The normal impulse of each column [kg m/s]."""
-        impulse = held.without_collider_impulses(residual)[:, self.axis]
-        each = [
-            inward * wall.column(jnp.where(wall.follows, (1 - wall.share) * wall.rows(impulse), 0))
-            for inward, wall in zip(self.inward, self.walls, strict=True)
-        ]
-        return self._tied(held, jnp.concatenate(each, axis=-1))
-
-    def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
-        """The rounding of a column's momentum [kg m/s], for both."""
-        mass = held.unconstrained.mass
-        weights = [wall.column(column_weight(wall, mass)) for wall in self.walls]
-        least = noise * self._tied(held, jnp.concatenate(weights, axis=-1))
-        return least, least
-
-    def friction(
-        self, held: ConstrainedNodes, active: Array, residual: NodeVector
-    ) -> Callable[[NodeVector], NodeVector] | None:
-        if self.coefficient is None:
-            return None
-        limits = self.coefficient * jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0)
-        limit = jnp.zeros(len(residual), limits.dtype)
-        for wall, part in zip(self.walls, jnp.split(limits, len(self.walls), axis=-1), strict=True):
-            limit = wall.with_rows(limit, jnp.where(wall.first, part, wall.rows(limit)))
-        normal = (jnp.arange(residual.shape[1]) == self.axis).astype(limit.dtype)
-        return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, 0.0, limit, v)
-
-    def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """The normal component of nodes that follow in it alone, as on the wall."""
-        across = jnp.zeros(shape[0], bool)
-        for k, wall in enumerate(self.walls):
-            held = wall.follows & ~wall.tied & active[..., k : k + 1]
-            across = wall.with_rows(across, wall.rows(across) | held)
-        return across[:, None] & (jnp.arange(shape[1]) == self.axis)
-
-    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """All components of the columns held."""
-        wall = self.walls[0]
-        columns = jnp.broadcast_to(active.any(axis=-1), (wall.layers, *wall.shape))
-        return jnp.broadcast_to(columns.reshape(-1, 1), shape)
-
-    def _tied(self, held: ConstrainedNodes, columns: Array) -> Array:
-        """A quantity of the columns, summed over columns that are each other's image in other planes."""
-        nodes = held.unconstrained
-        walls = (wall for contact in nodes.contacts if isinstance(contact, PlaneContact) for wall in contact.walls)
-        for image in (*walls, *nodes.potential.mirror.images):
-            if isinstance(image, Image | WallImage) and image.axis != self.axis:
-                columns = image.united(columns)
-        return columns
-
-
-class HeldPlanes(PlaneContact):
-    """Walls at right angles to an axis that what flows never leaves: their columns are always held."""
-
-    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
-        del nodes, explicit
-        return True
-
-    def likely_held(self, held: ConstrainedNodes, v: NodeVector) -> Array:
-        del held, v
-        return self.shut
-
-    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> Array:
-        del held
-        return jnp.zeros(self.shut.shape, v.dtype)
-
-    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Array:
-        del held
-        return jnp.zeros(self.shut.shape, residual.dtype)
-
-    def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
-        del held
-        return noise, noise
-
-    def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """None: what follows has no force of its own."""
-        del active
-        return jnp.zeros(shape, bool)
-
-
-def column_weight(wall: WallImage, mass: NodeScalar) -> Array:
-    """m_i (1 − B_i S/M) [kg] of the nodes that follow b, zero at others, as rows of the wall."""
-    rows = wall.rows(mass)
-    first = rows * wall.share
-    total, square = wall.column(first), wall.column(first * wall.share)
-    return jnp.where(wall.follows, rows - first * total / jnp.where(square == 0, 1, square), 0)
-
-
 class ContactPlane(AbstractPlane):
     """A rigid plane that the material may leave, and along which it slides with Coulomb friction.
 
@@ -436,30 +295,3 @@ class ContactPlane(AbstractPlane):
         wall = wall_image(self.axis, position, self.inward, grid, window, order)
         plane = plane_contact((wall,), (self.inward,), self.friction, around)
         return (plane,) if faces.explicit else (replace(landing, beside=~shut), plane)
-
-
-def plane_contact(
-    walls: tuple[WallImage, ...],
-    inward: tuple[Array | int, ...],
-    friction: Scalar | None,
-    around: Float[Array, "n s"],
-    kind: type[PlaneContact] = PlaneContact,
-) -> PlaneContact:
-    """The contact of walls across an axis with the columns around particles whose gap is shut, where the weights of
-    those have a sum, shape (n, s)."""
-    shut = [wall.column(wall.rows(around[:, k])) > 0 for k, wall in enumerate(walls)]
-    return kind(walls, inward, friction, jnp.concatenate(shut, axis=-1))
-
-
-def fluid_walls(
-    axis: int,
-    places: tuple[tuple[Scalar, Array | int], ...],
-    faces: Faces,
-    grid: Grid,
-    window: Int[Array, "d"],
-    *,
-    sticks: bool = False,
-) -> tuple[WallImage, ...]:
-    """The maps of walls across an axis, of coordinates [m] and inward normals, for what flows (see `wall_image`)."""
-    order, filled = len(faces.stencil.basis.knots) - 1, (faces.stencil, faces.flowing_volume)
-    return tuple(wall_image(axis, at, inward, grid, window, order, filled, sticks=sticks) for at, inward in places)

@@ -12,7 +12,7 @@ from mpmjax._types import Array, Bool, Corner, Float, Int, NodeVector, ParticleV
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._planes import SHUT, HeldPlanes, fluid_walls, plane_contact
+from mpmjax.boundary._plane_contact import SHUT, HeldPlanes, fluid_walls, plane_contact
 from mpmjax.boundary._surface_contact import SIGNS, Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
 from mpmjax.discretisation import Grid, scatter
