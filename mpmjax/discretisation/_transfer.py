@@ -310,6 +310,7 @@ def g2p(
     elif transfer.affine:
         _, slopes = gather(stencil.least_squares, jnp.concatenate(fields, axis=1), saved=True)
         affine = [*jnp.split(la.transpose(slopes), len(fields))]
-    new, changed, *_ = *(Gathered(*both, slope) for both, slope in zip(seen, affine, strict=True)), None
+    each = zip(seen, affine, strict=True)
+    new, changed, *_ = *(Gathered(value, slopes, slope) for (value, slopes), slope in each), None
     C = transfer.affine_velocity(C, new, changed) if transfer.affine else new.gradient if keep_gradient else None
     return ParticleMotion(carrier, transfer.velocity(v, new, changed), C, gradient, x, F)

@@ -130,7 +130,8 @@ def _in_order(wanted: Bool[Array, ""], order: Order, state: State) -> State:
     wanted."""
     groups = [_moved(wanted, order[rows] - rows.start, (F, history)) for rows, F, history in by_material(state)]
     deformations, histories = zip(*groups, strict=True)
-    return State(*_moved(wanted, order, (state.x, state.v, state.C)), deformations, histories)
+    x, v, C = _moved(wanted, order, (state.x, state.v, state.C))
+    return State(x, v, C, deformations, histories)
 
 
 def _moved(wanted: Bool[Array, ""], order: Order, tree: Any) -> Any:

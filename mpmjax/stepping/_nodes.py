@@ -184,11 +184,11 @@ def particles_to_grid(
     joined = joined and (stencil.is_least_squares or not scene.transfer.affine)
     potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), size)
     A, B = potential.stress_factors()  # of the flux V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
-    viscous = explicit_viscosity and C is not None and potential.material_viscous
-    if B is not None and (viscous or not joined):
+    L = C if explicit_viscosity and potential.material_viscous else None
+    if B is not None and (L is not None or not joined):
         A, B = la.matmul(A, la.transpose(B)), None
-    if viscous:
-        L = C if stencil.radius is None else in_space(stencil.radius, v, C)
+    if L is not None:
+        L = L if stencil.radius is None else in_space(stencil.radius, v, L)
         A = A + potential.weighted_viscous_stress(L)
     gravity, body_force = jnp.asarray(scene.gravity), None
     if scene.body_force is not None:

@@ -137,7 +137,7 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
     if potential.mirror.images:
         before, motion = jax.tree.map(potential.mirror.unfold, (before, motion))
     radius, points = potential.stencil.radius, potential.material_points
-    together = len(points) == 1 and points[0].strained_by_gradient and radius is None
+    together = len(points) == 1 and points[0].strained_by_gradient and radius is None  # F is moved by G2P itself
     gathered = g2p(
         scene.transfer,
         potential.stencil,
@@ -152,12 +152,15 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
         keep_gradient=scene.keeps_gradient,
     )
     grad_v = gathered.gradient if radius is None else in_space(radius, gathered.carrier, gathered.gradient)
-    F = [gathered.F] if together else [q.deformation + dt * q.change(q.rows_of(grad_v)) for q in points]
+    if (F := gathered.F) is None:
+        deformations = [q.deformation + dt * q.change(q.rows_of(grad_v)) for q in points]
+    else:
+        deformations = [F]
     after = State(
         x=particle_first(gathered.x),
         v=particle_first(gathered.velocity),
         C=None if gathered.affine is None else particle_first(gathered.affine),
-        deformations=tuple(map(particle_first, F)),
+        deformations=tuple(map(particle_first, deformations)),
         histories=particles.histories,
     )
     moved = with_state(particles, after)
