@@ -35,9 +35,9 @@ def scattered(kernel, gradient, d):
 
 
 def on_particles(transfer, stencil, v, before, after):
-    """`g2p` of NumPy arrays, as NumPy arrays."""
-    arrays = (jnp.asarray(a) for a in (v, before, after))
-    return jax.tree.map(np.asarray, to_particles(transfer, stencil, *arrays))
+    """`g2p` of NumPy arrays, as NumPy arrays, of particles at zero."""
+    arrays = (jnp.asarray(a) for a in (0 * v, v, before, after))
+    return jax.tree.map(np.asarray, to_particles(transfer, stencil, 0.1, *arrays))
 
 
 def on_nodes(stencil, mass, v, C, size):
@@ -89,7 +89,7 @@ def test_g2p_conserves_momentum(transfer, kernel, d):
     node_mass, momentum = on_nodes(stencil, mass, v, C if transfer.affine else None, grid.size)
     before = momentum / np.where(node_mass > 0, node_mass, 1)[:, None]
     after = before + noise(grid, d)
-    moved, new, affine, _ = on_particles(transfer, stencil, v, before, after)
+    moved, new, affine, *_ = on_particles(transfer, stencil, v, before, after)
     on_grid = node_mass[:, None] * after
     np.testing.assert_allclose((mass * moved).sum(axis=1), on_grid.sum(axis=0), atol=1e-13)
     np.testing.assert_allclose((mass * new).sum(axis=1), on_grid.sum(axis=0), atol=1e-13)
@@ -111,7 +111,7 @@ def test_apic_reproduces_affine_motion(kernel, gradient, d):
     node_mass, momentum = on_nodes(stencil, mass, v, C, grid.size)
     field = a + nodes @ B.T
     assert_close(momentum, node_mass[:, None] * field, 1e-14)
-    moved, new, affine, _ = on_particles(mpm.APIC(), stencil, v, 0 * field, field)
+    moved, new, affine, *_ = on_particles(mpm.APIC(), stencil, v, 0 * field, field)
     assert_close(moved, v, 1e-13)
     assert_close(new, v, 1e-13)
     assert_close(affine, C, 1e-13)
@@ -125,7 +125,7 @@ def test_a_constant_velocity_stays(transfer, kernel, d):
     grid, _, stencil, _, v, _, _ = scattered(kernel, GRADIENTS["mls"], d)
     constant = np.broadcast_to(np.arange(1.0, d + 1), (grid.size, d))
     expected = np.broadcast_to(constant[0][:, None], v.shape)
-    moved, new, affine, _ = on_particles(transfer, stencil, expected, constant, constant)
+    moved, new, affine, *_ = on_particles(transfer, stencil, expected, constant, constant)
     assert_close(moved, expected, 1e-14)
     assert_close(new, expected, 1e-14)
     assert (affine is not None) == transfer.affine
@@ -154,21 +154,27 @@ def test_flip_blends_the_change_with_pic(d):
 @EACH_GRADIENT
 @EACH_TRANSFER
 def test_what_deforms_is_the_gradient_of_what_carries(transfer, gradient, kernel, d):
-    """By the chosen operator, of the mean velocity if there is one; an impulse at the particles is its transpose."""
-    grid, _, stencil, _, v, C, mass = scattered(kernel, gradient, d)
+    """By the chosen operator, of the mean velocity if there is one; x and F are moved by them; an impulse at the
+    particles, of one factor or of two, is the transpose."""
+    grid, _, stencil, x, v, C, mass = scattered(kernel, gradient, d)
     if not transfer.affine:
         C = None
     before, after, mean = (jnp.asarray(noise(grid, d, seed)) for seed in (3, 4, 5))
+    A, F = (jnp.asarray(np.random.default_rng(seed).normal(size=(d, d, v.shape[1]))) for seed in (6, 7))
     for mean_, carrier in ((None, after), (mean, mean)):
-        moved, _, _, slope = to_particles(transfer, stencil, jnp.asarray(v), before, after, mean_)
+        arrays = (jnp.asarray(a) for a in (x, v))
+        moved, _, _, slope, end, strained = to_particles(transfer, stencil, 0.1, *arrays, before, after, mean_, F=F)
         value, slopes = from_nodes(stencil, carrier)
         assert_close(moved, value, 1e-14)
         assert_close(slope, jnp.swapaxes(slopes, 0, 1), 1e-14)
+        assert_close(end, x + 0.1 * value, 1e-14)
+        assert_close(strained, F + 0.1 * jnp.einsum("abp,bcp->acp", slope, F), 1e-14)
     if stencil.is_least_squares or not transfer.affine:
-        impulse = jnp.asarray(np.random.default_rng(6).normal(size=(d, d, v.shape[1])))
-        given = [to_grid(stencil, mass, jnp.asarray(v), C, grid.size, i) for i in (impulse, None)]
-        change = given[0][0][:, None] * (given[0][1] - given[1][1])
-        assert float((change * mean).sum()) == pytest.approx(float((impulse * slope).sum()), rel=1e-10)
+        for B, impulse in ((None, 2 * A), (F, 2 * jnp.einsum("abp,cbp->acp", A, F))):
+            factors = ((jnp.asarray(2.0), A, B), None)
+            given = [to_grid(stencil, mass, jnp.asarray(v), C, grid.size, each) for each in factors]
+            change = given[0][0][:, None] * (given[0][1] - given[1][1])
+            assert float((change * mean).sum()) == pytest.approx(float((impulse * slope).sum()), rel=1e-10)
 
 
 def test_velocity_and_its_gradient_are_those_of_the_new_velocity():
@@ -183,7 +189,8 @@ def test_velocity_and_its_gradient_are_those_of_the_new_velocity():
             alpha = transfer.alpha if isinstance(transfer, mpm.FLIP) else 0.0
             ends = [from_nodes(stencil, a)[0] for a in (after, after - before)]
             for mean_ in (None, mean):
-                _, new, C, _ = to_particles(transfer, stencil, jnp.asarray(v), before, after, mean_, keep_gradient=True)
+                arrays = (jnp.asarray(v), before, after, mean_)
+                _, new, C, *_ = to_particles(transfer, stencil, 0.1, 0 * arrays[0], *arrays, keep_gradient=True)
                 assert_close(C, expected, 1e-14)
                 assert_close(new, (1 - alpha) * ends[0] + alpha * (v + ends[1]), 1e-14)
         if name == "spline":
@@ -221,7 +228,7 @@ def test_p2g_and_g2p_agree_with_a_plain_double_loop(kernel, d):
     got_mass, got_momentum = on_nodes(stencil, m, v, C, grid.size)
     assert_close(got_mass, node_mass, 1e-13)
     assert_close(got_momentum, momentum, 1e-13)
-    moved, _, _, _ = on_particles(mpm.PIC(), stencil, v, field, field)
+    moved, *_ = on_particles(mpm.PIC(), stencil, v, field, field)
     assert_close(moved[:, : len(some)], gathered, 1e-13)
 
 

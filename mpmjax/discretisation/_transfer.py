@@ -309,7 +309,7 @@ def g2p(
         affine = [slope for _, slope in seen]
     elif transfer.affine:
         _, slopes = gather(stencil.least_squares, jnp.concatenate(fields, axis=1), saved=True)
-        affine = [*jnp.split(la.transpose(slopes), len(fields))]
+        affine = [la.transpose(part) for part in jnp.split(slopes, len(fields), axis=1)]
     each = zip(seen, affine, strict=True)
     new, changed, *_ = *(Gathered(value, slopes, slope) for (value, slopes), slope in each), None
     C = transfer.affine_velocity(C, new, changed) if transfer.affine else new.gradient if keep_gradient else None
