@@ -226,6 +226,12 @@ def test_half_of_two_bodies_is_pushed_as_the_whole():
     assert_close(found[1], found[0], 0, 3e-4 * abs(found[0]).max())
 
 
+def test_bodies_that_touch_do_so_beside_a_clamp_too():
+    """The gap is that beside a symmetry plane: where bodies are is mirrored alike, only velocities are not."""
+    gaps = [contact_of(*stacked(boundary=plane(0, 0.0)))[0].gap for plane in (mpm.SymmetryPlane, mpm.ClampPlane)]
+    np.testing.assert_array_equal(*gaps)
+
+
 def slid(name, friction, *, steps, dt):
     """What a block has moved down a slab of 30 degrees, and how fast it is at half of the time and at its end."""
     law = mpm.NeoHookean(1e6, 0.3)

@@ -125,6 +125,13 @@ def test_a_block_between_clamps_that_turn_together_turns_as_a_rigid_body(d):
     np.testing.assert_allclose(torque, 0, atol=1e-5 * 1e4 * 0.3**d)
 
 
+def test_a_budget_refuses_planes_that_move():
+    for plane in (PLANES[2], mpm.ClampPlane(1, 0.0, motion=PLANES[2].motion)):
+        scene, particles = block(2, boundary=plane, description=mpm.TotalLagrangian())
+        with pytest.raises(ValueError, match="does not know the work of a SymmetryPlane or ClampPlane that moves"):
+            mpm.budget(scene, particles, steps=1, dt=1e-3)
+
+
 def test_a_clamp_moves_in_the_total_description_only():
     with pytest.raises(ValueError, match="moves in the total description only"):
         block(2, boundary=mpm.ClampPlane(1, 0.0, motion=up(2, 0.6)))

@@ -228,8 +228,8 @@ def budget(
         the particles after the last step, and the budget, each of its terms with a leading axis f.
 
     Raises:
-        ValueError: from `prepare`, a step that is not positive, a plane of symmetry that moves, or a body under a
-            constraint, such as a rigid one.
+        ValueError: from `prepare`, a step that is not positive, a plane that mirrors and moves, or a body under
+            a constraint, such as a rigid one.
     """
     require_positive("dt [s]", dt, particles.x.dtype)
     steps, start = require_whole("steps", steps, 1), require_whole("start", start, 0)
@@ -241,8 +241,8 @@ def budget(
     )
     require(
         not scene.moving_mirrors,
-        "A budget does not know the work of a SymmetryPlane that moves: take a plane at rest, in its own frame, "
-        "or a SlipCollider of a HalfSpace.",
+        "A budget does not know the work of a SymmetryPlane or ClampPlane that moves: take one at rest, in its own "
+        "frame, a SlipCollider of a HalfSpace, or a Grip.",
     )
     scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
     return _budget(scene, prepare(scene, particles), jnp.asarray(start, particles.x.dtype), dt, method, steps)

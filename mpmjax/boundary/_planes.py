@@ -187,6 +187,9 @@ class ClampPlane(AbstractPlane):
     def dim(self) -> int | None:
         return None if self.motion is None else self.motion.dim
 
+    def mirror(self) -> MirrorPlace:
+        return MirrorPlace(self.axis, self.position, self.motion)
+
     def check(self, grid: Grid, *, total: bool) -> None:
         """A motion needs the total description."""
         AbstractPlane.check(self, grid, total=total)

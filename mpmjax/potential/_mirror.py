@@ -21,7 +21,7 @@ from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector,
 from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import require
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import Motion
+from mpmjax.geometry import AbstractMotion
 from mpmjax.potential._wall_image import WallImage
 
 
@@ -30,7 +30,7 @@ class MirrorPlace(NamedTuple):
 
     axis: int  # the direction of its normal
     position: Scalar  # coordinate on the lattice of nodes [m]
-    motion: Motion | None  # how it moves; None if it rests
+    motion: AbstractMotion | None  # how it moves; None if it rests
 
 
 @custom_derivative
@@ -239,6 +239,11 @@ class Mirror(eqx.Module):
                 on_it = image.along((image.odd == 0) & (image.even == 1))
                 field = image.scalar(jnp.where(on_it, 2 * field, field))
         return field
+
+    def of_places(self) -> "Mirror":
+        """The mirrors of vectors that say where bodies are: only the normal component is odd, at a plane that holds all
+        of the velocity too."""
+        return Mirror(tuple(replace(i, holds_all=False) if isinstance(i, Image) else i for i in self.images))
 
     def without_ties(self) -> "Mirror":
         """The mirrors alone, without what ties nodes of one body together."""

@@ -31,7 +31,7 @@ from mpmjax.discretisation import (
     make_stencil,
     without_empty,
 )
-from mpmjax.geometry import Motion
+from mpmjax.geometry import AbstractMotion
 from mpmjax.material import AbstractLaw
 from mpmjax.potential import MirrorPlace, carried_by
 from mpmjax.state._axis import check_axis, with_axis
@@ -322,7 +322,7 @@ class Scene(eqx.Module):
         return self.description.total
 
     @property
-    def moving_mirrors(self) -> dict[int, Motion]:
+    def moving_mirrors(self) -> dict[int, AbstractMotion]:
         """The motions of mirrors that move, by the axis across which they are."""
         return {mirror.axis: mirror.motion for mirror in self.mirrors if mirror.motion is not None}
 

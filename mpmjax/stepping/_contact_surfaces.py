@@ -75,7 +75,7 @@ def contacts_of_bodies(
     sums = scatter(stencil, values, None, scene.grid.size)
     # w (x_p − x_i)_a = −D_a g_a, with g the moving-least-squares gradient
     arms = -jnp.eye(d, dtype=part.dtype)[..., None] * (part * stencil.moment / dx)
-    middle = images.fold(scatter(stencil.least_squares, None, arms, scene.grid.size)).T
+    middle = images.of_places().fold(scatter(stencil.least_squares, None, arms, scene.grid.size)).T
     scalars = images.fold_scalar(sums[:, :4]).T
     velocity = images.fold(sums[:, 4:]).T
 
