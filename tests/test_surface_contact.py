@@ -1,6 +1,7 @@
 """Contact at the faces of particles: walls and colliders push where the material's surface is."""
 
 import dataclasses
+from itertools import pairwise
 
 import equinox as eqx
 import jax
@@ -522,13 +523,28 @@ def test_slivers_at_a_curved_edge_do_not_shorten_explicit_steps(d):
 def test_walls_that_hold_a_fluid_beside_a_solid_feel_all_that_they_take(method, kind):
     """Between nodes and in a corner: their impulse is the change of momentum that nothing else gives, and a start
     velocity has the derivative of differences. The columns of the solid are held at their nodes."""
+    after = beside_a_solid(kind, method, first=False)
+    speed = lambda scale: (after(scale)[0].v ** 2).sum()  # noqa: E731
+    difference = (speed(1 + 1e-4) - speed(1 - 1e-4)) / 2e-4
+    assert_close(jax.grad(speed)(1.0), difference, 1e-5)
+
+
+@pytest.mark.parametrize("kind", ["sticky", *thorough("slip")])
+def test_walls_hold_columns_together_that_meet_behind_a_solid_in_their_corner(kind):
+    """The fluid reaches the nodes before the corner and none behind it."""
+    beside_a_solid(kind, METHODS["explicit"], first=True)
+
+
+def beside_a_solid(kind, method, *, first):
+    """A function of the start velocity's scale to a step of a fluid beside a solid, which is in the walls' first corner
+    or the last one. The walls' impulse is the change of momentum that nothing else gives."""
     grid, at, dt = mpm.Grid((16, 14), 0.1, origin=(-4, -4)), 0.02, 2e-3
-    fluid = mpm.fill(mpm.Box((at, at), (at + 0.4, at + 0.3)), grid, density=1e3)
-    solid = mpm.fill(mpm.Box((at + 0.4, at), (at + 0.7, at + 0.3)), grid, density=1e3)
-    body = mpm.join(fluid, solid)
+    cuts, laws = ((at, at + 0.15), (LAW, mpm.Fluid(1e4))) if first else ((at, at + 0.4), (mpm.Fluid(1e4), LAW))
+    blocks = (mpm.Box((a, at), (b, at + 0.3)) for a, b in pairwise((*cuts, at + 0.7)))
+    body = mpm.join(*(mpm.fill(box, grid, density=1e3) for box in blocks))
     body = dataclasses.replace(body, v=jnp.asarray(np.random.default_rng(0).normal(size=body.x.shape)) * 0.01)
     walls = vessel(kind, (at, at), (at + 0.7, INF))
-    scene = mpm.Scene(grid, (mpm.Fluid(1e4), LAW), boundary=walls, gravity=(0.0, -1.0), boundary_forces=True)
+    scene = mpm.Scene(grid, laws, boundary=walls, gravity=(0.0, -1.0), boundary_forces=True)
     start = mpm.prepare(scene, body)
 
     def after(scale):
@@ -539,6 +555,4 @@ def test_walls_that_hold_a_fluid_beside_a_solid_feel_all_that_they_take(method, 
     weight = dt * float(body.mass.sum()) * np.array([0.0, -1.0])
     change = (body.mass[:, None] * (end.v - body.v)).sum(axis=0)
     assert_close(-info.boundaries.impulse[0] + weight, change, 1e-6)
-    speed = lambda scale: (after(scale)[0].v ** 2).sum()  # noqa: E731
-    difference = (speed(1 + 1e-4) - speed(1 - 1e-4)) / 2e-4
-    assert_close(jax.grad(speed)(1.0), difference, 1e-5)
+    return after

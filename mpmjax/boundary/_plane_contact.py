@@ -108,11 +108,14 @@ class PlaneContact(AbstractContact):
     def _tied(self, held: ConstrainedNodes, columns: Array) -> Array:
         """A quantity of the columns, summed over columns that are each other's image in other planes."""
         nodes = held.unconstrained
-        walls = (wall for contact in nodes.contacts if isinstance(contact, PlaneContact) for wall in contact.walls)
-        for image in (*walls, *nodes.potential.mirror.images):
+        for image in (*_walls_of(nodes), *nodes.potential.mirror.images):
             if isinstance(image, Image | WallImage) and image.axis != self.axis:
                 columns = image.united(columns)
         return columns
+
+
+def _walls_of(nodes: AbstractNodes) -> list[WallImage]:
+    return [wall for contact in nodes.contacts if isinstance(contact, PlaneContact) for wall in contact.walls]
 
 
 class HeldPlanes(PlaneContact):
@@ -123,8 +126,11 @@ class HeldPlanes(PlaneContact):
         return True
 
     def likely_held(self, held: ConstrainedNodes, v: NodeVector) -> Array:
-        del held, v
-        return self.shut
+        """With the columns that other walls tie to them: else what these move would be left behind."""
+        columns = self.shut.astype(v.dtype)
+        for wall in _walls_of(held.unconstrained):
+            columns = columns if wall.axis == self.axis else wall.united(columns, whole=True)
+        return columns > 0
 
     def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> Array:
         del held

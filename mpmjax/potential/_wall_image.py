@@ -77,9 +77,10 @@ class WallImage(eqx.Module):
         """Bᵀ for an even scalar field."""
         return self._gathered(field, self.tied, 1)
 
-    def united(self, blocks: Array) -> Array:
-        """Even scalars, summed over the nodes that are tied to each other, at each of them (as B Bᵀ does)."""
-        rows, alike = self.rows(blocks), self.base | self.tied
+    def united(self, blocks: Array, *, whole: bool = False) -> Array:
+        """Even scalars, summed over the nodes that are tied to each other, at each of them (as B Bᵀ does), or over the
+        `whole` of what follows b."""
+        rows, alike = self.rows(blocks), self.base | (self.follows if whole else self.tied)
         return self.with_rows(blocks, jnp.where(alike, self.column(jnp.where(alike, rows, 0)), rows))
 
     def vector(self, field: NodeVector) -> NodeVector:
