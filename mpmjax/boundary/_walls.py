@@ -152,7 +152,7 @@ class SlipBox(AbstractHoldingBox):
     `SymmetryPlane`, which is the same wall to second order: frictionless, and never left.
 
     A fluid is held by columns of nodes whose normal velocity is linear across the wall and zero on it, wherever that
-    lies, so that it stays at rest.
+    lies, so that it stays at rest; its motion has no derivative by a wall's place.
 
     *When it breaks*: a box that moves holds fluids at nodes too, and they press on it by a tenth too much.
 
