@@ -105,7 +105,7 @@ def render(
     from matplotlib import cm, colormaps, colors, pyplot as plt  # here: it takes a second that only pictures should pay
 
     bar = None
-    if colour is not None:
+    if colour is not None and there.any():
         least, most = np.nanmin(values), np.nanmax(values)
         low, high = (least, most) if colour in _COUNTED else np.nanpercentile(values, (1, 99))
         low, high = (low, high) if low < high else (least, most)
