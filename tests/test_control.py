@@ -4,6 +4,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import diffrax
@@ -13,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import LAWS, TRANSFERS, assert_close, block, ids, thorough
+from matplotlib import pyplot as plt
 
 import mpmjax as mpm
 from mpmjax.extensions import Active, Controls, Inlet, Outlet
 from mpmjax.verification import check_law
+from mpmjax.viz._render import _flat_canvas, _solid_canvas
 
 DT = 2e-3
 MUSCLE = Active(LAWS["neo_hookean"], 2e3, angle=np.arctan2(4, 3))
@@ -301,6 +304,18 @@ def test_a_picture_of_nothing_has_no_colours(tmp_path):
         mpm.render(run, tmp_path / "none.png", colour="speed")
 
 
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_pictures_show_where_particles_with_mass_are(d, tmp_path):
+    scene, particles = block(d, side=9)
+    particles = jax.tree.map(lambda a: a[(particles.x < 0.3).all(axis=1)], particles)
+    drain = Outlet(mpm.HalfSpace((0.1,) * d, (1.0,) + (0.0,) * (d - 1)), rest=(0.9,) * d)
+    run = mpm.simulate(scene, particles, t1=2 * DT, dt=DT, control=drain, save_every=1)
+    canvas = _flat_canvas if d == 2 else partial(_solid_canvas, view=(30.0, 20.0))
+    assert canvas(run, None, "")[0].axes[0].get_xlim()[1] < 0.5
+    plt.close()
+    mpm.render(run, tmp_path / "run.png", colour="speed")
+
+
 def jet(speed, length=0.3):
     grid = mpm.Grid((20, 14), 0.1, origin=(-5, -3))
     stock = mpm.fill(mpm.Box((-0.9, 0.4), (0.0, 0.6)), grid, density=1e3)
@@ -326,7 +341,8 @@ def test_a_nozzle_lets_in_mass_as_fast_as_it_flows():
 def test_the_gradient_by_the_speed_of_a_nozzle_is_that_of_differences():
     def reached(speed):
         scene, inlet = jet(speed)
-        final = mpm.simulate(scene, inlet.particles(), t1=0.2, dt=2e-3, control=inlet).final
+        of = {"control": inlet, "checkpoint_bytes": 2**15}
+        final = mpm.simulate(scene, inlet.particles(), t1=0.2, dt=2e-3, **of).final
         return (final.mass[:, None] * final.x**2).sum()
 
     value, speed, h = jax.jit(reached), 1.013, 1e-6
