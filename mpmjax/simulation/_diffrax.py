@@ -118,11 +118,11 @@ class Problem(eqx.Module):
         after = canonical(after, y.particles.x.dtype)
         whole = isinstance(after, tuple) and len(after) == 3 and isinstance(after[0], Scene)
         require(whole, f"A control must return (scene, particles, memory), got {shortened(str(after))}.")
-        given, got = ({"particles": q, "memory": m} for _, q, m in (before, after))
+        asked, new = ({"particles": q, "memory": m} for _, q, m in (before, after))
         require(
-            bool(eqx.tree_equal(jax.tree.map(jnp.shape, given), jax.tree.map(jnp.shape, got))),
+            bool(eqx.tree_equal(jax.tree.map(jnp.shape, asked), jax.tree.map(jnp.shape, new))),
             "A control must return particles and memory of the structure and shapes that it was given"
-            + _first_difference(given, got),
+            + _first_difference(asked, new),
         )
         scene, particles, memory = after
         fixed = [([type(a) for a in (*s.boundary, *s.loads, *s.laws)], s.grid.shape) for s in (self.scene, scene)]
@@ -150,10 +150,10 @@ class Problem(eqx.Module):
         return replace(self, scene=scene, particles=particles), replace(y, particles=state, order=order)
 
 
-def _first_difference(given: Any, got: Any) -> str:
+def _first_difference(asked: Any, new: Any) -> str:
     """The end of a message that says which leaf of two trees is not alike."""
     name = partial(jax.tree_util.keystr, simple=True, separator=".")
-    a, b = ({name(path): np.shape(x) for path, x in jax.tree_util.tree_leaves_with_path(t)} for t in (given, got))
+    a, b = ({name(path): np.shape(x) for path, x in jax.tree_util.tree_leaves_with_path(t)} for t in (asked, new))
     where = next((key for key in {**a, **b} if a.get(key) != b.get(key)), None)
     return "." if where is None else f": {where} has shape {b.get(where)} and had {a.get(where)}."
 
