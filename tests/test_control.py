@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import diffrax
@@ -12,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import LAWS, TRANSFERS, assert_close, block, ids, thorough
+from matplotlib import pyplot as plt
 
 import mpmjax as mpm
 from mpmjax.extensions import Active, Controls, Inlet, Outlet
 from mpmjax.verification import check_law
+from mpmjax.viz._render import _flat_canvas, _solid_canvas
 
 DT = 2e-3
 MUSCLE = Active(LAWS["neo_hookean"], 2e3, angle=np.arctan2(4, 3))
@@ -78,6 +82,24 @@ def test_a_control_that_changes_nothing_changes_no_bit(method):
     jax.tree.map(np.testing.assert_array_equal, free.final, idle.final)
 
 
+def test_a_control_acts_in_the_total_description_and_in_single_precision():
+    scene, particles = block(2, description=mpm.TotalLagrangian(), boundary=GRIP)
+
+    def control(scene, particles, t, dt, memory):
+        return eqx.tree_at(lambda s: s.gravity, scene, (memory, -memory)), particles, memory + 1.0
+
+    for dtype in (jnp.float64, jnp.float32):
+        q = jax.tree.map(lambda a, dtype=dtype: a.astype(dtype), particles)
+        run = mpm.simulate(scene, q, t1=4 * DT, dt=DT, control=control, memory=0.0)
+        step = mpm.prepare(scene, q)
+        for n in range(4):
+            here = eqx.tree_at(lambda s: s.gravity, scene, (float(n), -float(n)))
+            step = mpm.step(here, step, n * DT, DT)[0]
+        assert run.final.x.dtype == dtype
+        assert_close(run.final.v, step.v, 100 * float(jnp.finfo(dtype).eps))
+        assert float(run.final_memory) == 4
+
+
 @pytest.mark.parametrize("forward", [False, *thorough(True)])
 @pytest.mark.parametrize("method", [mpm.Explicit(), *thorough(mpm.SemiImplicit())])
 def test_the_gradient_by_a_policy_is_that_of_differences(method, forward):
@@ -106,6 +128,10 @@ def test_a_run_goes_on_from_its_memory_and_its_file(whole, tmp_path):
     other = of | {"control": Policy(2 * GAIN)}
     with pytest.raises(ValueError, match="holds another run: its control is 'Policy "):
         mpm.record(path, scene, particles, t1=12 * DT, dt=DT, save_every=4, resume=True, **other)
+    for memory in (None, {"shift": np.zeros(2), "mean": 1.0}, {"shift": np.zeros((2, 1)), "mean": 0.0}):
+        other = of | {"memory": memory}
+        with pytest.raises(ValueError, match=r"holds another run: its control is 'Policy .* with memory"):
+            mpm.record(path, scene, particles, t1=12 * DT, dt=DT, save_every=4, resume=True, **other)
     ended = mpm.record(path, scene, particles, t1=12 * DT, dt=DT, save_every=4, resume=True, **of)
     jax.tree.map(np.testing.assert_array_equal, ended.final, whole.final)
     jax.tree.map(np.testing.assert_array_equal, ended.final_memory, whole.final_memory)
@@ -134,11 +160,22 @@ def test_a_fault_is_named_with_the_scene_of_its_step():
 
 
 def test_controls_that_break_their_promise_are_refused():
-    scene, particles = block(2)
+    scene, particles = block(2, material=MUSCLE)
+    walled, _ = block(2, material=MUSCLE, boundary=GRIP)
+
+    def contract(s, q, t, dt, m):
+        return s, eqx.tree_at(lambda q: q.history.activation, q, 0.5), m
+
     for control, memory, told in (
         (lambda s, q, t, dt, m: (s, q), None, r"must return \(scene, particles, memory\)"),
-        (lambda s, q, t, dt, m: (s, q, (m, m)), 0.0, r"of the structure and shapes that it was given, here \(\)"),
+        (lambda s, q, t, dt, m: q, None, r"must return \(scene, particles, memory\)"),
+        (lambda s, q, t, dt, m: (s, q, (m, m)), 0.0, r"shapes that it was given: memory has shape None and had \(\)"),
+        (lambda s, q, t, dt, m: (s, q, [m[0]]), (0.0,), "of the structure and shapes that it was given"),
+        (contract, None, r"particles.histories.0.activation has shape \(\) and had \(36,\)"),
+        (lambda s, q, t, dt, m: (walled, q, m), None, "the boundaries, loads, laws and grid that it was given"),
         (lambda s, q, t, dt, m: (s, q, m), True, "memory must be a pytree of floats"),
+        (Outlet(mpm.Box((0.0,) * 3, (1.0,) * 3)), None, "region must have 2 coordinates, as the run, got 3"),
+        (replace(jet(1.0)[1], first=5), None, "from number 5 on must be among the 36 of the run"),
     ):
         with pytest.raises(ValueError, match=told):
             mpm.simulate(scene, particles, t1=DT, dt=DT, control=control, memory=memory)
@@ -158,6 +195,22 @@ def test_fibres_pull_along_their_direction():
     tangent = mpm.linalg.matrix_of(contracted.stress_differential(F), F)
     largest = np.linalg.eigvalsh(np.moveaxis(np.asarray(tangent), -1, 0))[:, -1]
     assert (largest <= contracted.stiffness_eigenvalues(F, 2, total=True).max(axis=0) * (1 + 1e-9)).all()
+
+
+def test_fibres_out_of_the_plane_are_as_in_space():
+    """Where the third stretch is one: the energy's λ and stresses in the plane, also of fibres normal to it."""
+    for elevation in (0.7, np.pi / 2):
+        scene, particles = block(2, material=replace(MUSCLE, elevation=elevation))
+        q = mpm.prepare(scene, particles)
+        F = jnp.asarray([[1.1, 0.2], [-0.1, 0.9]])
+        q = eqx.tree_at(lambda q: (q.history.activation, q.F), q, (q.mass**0, jnp.broadcast_to(F, q.F.shape)))
+        (points,) = scene.material_points(q)
+        tau = np.einsum("ijp,kjp->pik", points.stress(points.deformation), points.deformation)
+        assert_close(mpm.stress(scene, q)[:, :2, :2], tau / np.linalg.det(F))
+        law, whole = points.law.in_space(points.deformation)
+        pull = [law.energy(a) - law.law.energy(a) for law, a in ((points.law, points.deformation), (law, whole))]
+        assert_close(*pull)
+        check_law(eqx.tree_at(lambda law: law.tension, points.law, 700.0), dim=2)
 
 
 def with_absent(particles, every=3):
@@ -203,6 +256,66 @@ def test_particles_without_mass_change_nothing(options):
         assert_close(mpm.stable_dt(scene, many), mpm.stable_dt(scene, particles), 1e-2)
 
 
+def far_away(particles, count):
+    """The particles, the first of which have no mass and are at one place far off the others."""
+    rows, place = slice(count), np.full(particles.dim, 1.0) * float(jnp.ptp(particles.x)) * 1.5
+    mass, volume = (a.at[rows].set(0) for a in (particles.mass, particles.volume))
+    return replace(particles, x=particles.x.at[rows].set(place.astype(particles.x.dtype)), mass=mass, volume=volume)
+
+
+def test_what_is_not_there_is_in_no_measure():
+    """Nor in averages of volumes, and in the longest step it counts as its material."""
+    grid, law = mpm.Grid((30, 30), 0.1, origin=(-5, -5)), LAWS["neo_hookean"]
+    block = mpm.fill(mpm.Box((0.0, 0.0), (0.6, 0.4)), grid, density=100.0)
+    scene, some = mpm.Scene(grid, law, volume=mpm.AveragedVolume()), far_away(block, 12)
+    assert mpm.analysis.pieces(scene, some) == mpm.analysis.pieces(scene, block) == 1
+    assert mpm.fitting.Extent(0)(scene, some) == 0.575
+    assert mpm.fitting.Extent(1, "lower")(scene, replace(some, x=-some.x)) == -0.375
+    assert_close(mpm.analysis.density(scene, some), np.where(np.asarray(some.mass) > 0, 100.0, 0.0))
+    slope = jax.grad(lambda m: mpm.analysis.density(scene, replace(some, mass=m)).sum())(some.mass)
+    assert np.isfinite(slope).all()
+    drain = Outlet(mpm.Box((0.3, -1.0), (2.0, 1.0)), rest=(1.2, 1.2))
+    run = mpm.simulate(scene, block, t1=4 * DT, dt=DT, control=drain)
+    assert_close(run.final.F, np.broadcast_to(np.eye(2), run.final.F.shape))
+    assert_close(mpm.energy(scene, run.final).total, 0.0, 0, 1e-12)
+    heavy = mpm.fill(mpm.Box((0.8, 0.0), (1.2, 0.4)), grid, density=8e3)
+    both = mpm.Scene(grid, (law, law))
+    whole, part = (mpm.stable_dt(both, mpm.join(q, heavy)) for q in (block, some))
+    assert_close(part, whole, 1e-6)
+    waiting = mpm.join(far_away(block, block.count), heavy)
+    mpm.stable_dt(both, waiting)  # nor does a warning call it thin
+    mpm.attach(mpm.Scene(grid, (law, law), loads=mpm.PointLoad(mpm.PointsAt(((0.91, 0.1),)), (1.0, 0.0))), waiting)
+
+
+def test_dust_of_the_smallest_particles_is_not_rounded_to_nothing():
+    """Of a tenth of a picogram in single precision."""
+    grid = mpm.Grid((14, 14, 14), 1e-6, origin=(-3, -3, -3))
+    cube = mpm.fill(mpm.Box((0.0,) * 3, (3e-6,) * 3), grid, density=1e3, dtype=jnp.float32)
+    scene = mpm.Scene(grid, LAWS["neo_hookean"])
+    assert mpm.stable_dt(scene, far_away(cube, 40)) == pytest.approx(float(mpm.stable_dt(scene, cube)), rel=1e-5)
+
+
+def test_a_picture_of_nothing_has_no_colours(tmp_path):
+    scene, particles = block(2)
+    drain = Outlet(mpm.Box((-1.0, -1.0), (2.0, 2.0)), rest=(0.0, 0.0))
+    run = mpm.simulate(scene, particles, t1=DT, dt=DT, control=drain, save_every=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mpm.render(run, tmp_path / "none.png", colour="speed")
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_pictures_show_where_particles_with_mass_are(d, tmp_path):
+    scene, particles = block(d, side=9)
+    particles = jax.tree.map(lambda a: a[(particles.x < 0.3).all(axis=1)], particles)
+    drain = Outlet(mpm.HalfSpace((0.1,) * d, (1.0,) + (0.0,) * (d - 1)), rest=(0.9,) * d)
+    run = mpm.simulate(scene, particles, t1=2 * DT, dt=DT, control=drain, save_every=1)
+    canvas = _flat_canvas if d == 2 else partial(_solid_canvas, view=(30.0, 20.0))
+    assert canvas(run, None, "")[0].axes[0].get_xlim()[1] < 0.5
+    plt.close()
+    mpm.render(run, tmp_path / "run.png", colour="speed")
+
+
 def jet(speed, length=0.3):
     grid = mpm.Grid((20, 14), 0.1, origin=(-5, -3))
     stock = mpm.fill(mpm.Box((-0.9, 0.4), (0.0, 0.6)), grid, density=1e3)
@@ -228,7 +341,8 @@ def test_a_nozzle_lets_in_mass_as_fast_as_it_flows():
 def test_the_gradient_by_the_speed_of_a_nozzle_is_that_of_differences():
     def reached(speed):
         scene, inlet = jet(speed)
-        final = mpm.simulate(scene, inlet.particles(), t1=0.2, dt=2e-3, control=inlet).final
+        of = {"control": inlet, "checkpoint_bytes": 2**15}
+        final = mpm.simulate(scene, inlet.particles(), t1=0.2, dt=2e-3, **of).final
         return (final.mass[:, None] * final.x**2).sum()
 
     value, speed, h = jax.jit(reached), 1.013, 1e-6

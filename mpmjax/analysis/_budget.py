@@ -86,7 +86,8 @@ def grid_mass(scene: Scene, particles: Particles) -> Float[Array, ""]:
 
 @checked
 def pieces(scene: Scene, particles: Particles) -> int:
-    """The number of pieces of the material. Particles with a common node of non-zero weight are of one piece.
+    """The number of pieces of the material. Particles with a common node of non-zero weight are of one piece; those
+    without mass are of none.
 
     Pieces exchange neither momentum nor stress. In the updated description a body falls apart, whatever its law, when
     it is stretched until its particles lie further apart than the kernel reaches: *numerical fracture*. More pieces at
@@ -98,12 +99,14 @@ def pieces(scene: Scene, particles: Particles) -> int:
 
     scene = canonical(scene, particles.x.dtype)
     stencil = scene.stencil(prepare(scene, particles))
-    touching = np.asarray(stencil.weight) > 0
+    there = np.asarray(particles.mass) > 0
+    touching = (np.asarray(stencil.weight) > 0) & there
     particle = np.broadcast_to(np.arange(particles.count), touching.shape)[touching]
     _, node = np.unique(np.asarray(stencil.index)[touching], return_inverse=True)
-    size = particles.count + int(node.max()) + 1
+    size = particles.count + int(node.max(initial=-1)) + 1
     edges = (np.ones(node.size, bool), (particle, particles.count + node))
-    return csgraph.connected_components(sparse.coo_array(edges, (size, size)), directed=False)[0]
+    parts = csgraph.connected_components(sparse.coo_array(edges, (size, size)), directed=False)[0]
+    return parts - int((~there).sum())
 
 
 class EnergyBudget(eqx.Module):

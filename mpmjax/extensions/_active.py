@@ -81,11 +81,12 @@ class Contracted(AbstractMaterial):
     tension: PerParticle  # a T [Pa]
 
     def _fibre(self, F: Matrix) -> tuple[list[Array], Float[Array, "d p"], Array]:
-        """a0, n = F a0/λ and λ [-], shapes (d,), (d, p) and (p,)."""
+        """a0, n = F a0/λ and λ [-], shapes (d,), (d, p) and (p,); λ has the part out of the plane or line too."""
         angle, elevation = jnp.asarray(self.angle, F.dtype), jnp.asarray(self.elevation, F.dtype)
-        rest = [jnp.cos(angle) * jnp.cos(elevation), jnp.sin(angle) * jnp.cos(elevation), jnp.sin(elevation)][: len(F)]
+        whole = [jnp.cos(angle) * jnp.cos(elevation), jnp.sin(angle) * jnp.cos(elevation), jnp.sin(elevation)]
+        rest, beyond = whole[: len(F)], whole[len(F) :]
         f = jnp.stack([F[:, k] * a for k, a in enumerate(rest)]).sum(axis=0)
-        stretch = jnp.sqrt((f**2).sum(axis=0))
+        stretch = jnp.sqrt((f**2).sum(axis=0) + sum(a**2 for a in beyond))
         return rest, f / stretch, stretch
 
     def energy(self, F: Matrix) -> Array:

@@ -64,7 +64,7 @@ class Inlet(eqx.Module):
 
     *When it breaks*: in the total description, and with a window that follows. What is free and comes into the nozzle
     from outside is carried along. In the nozzle nothing is compressed or slowed: if it is blocked it presses without
-    bound.
+    bound. `stable_dt` knows the density of what is there: of a material that is yet to come ask with the stock.
 
     *Good values*: a length of three spacings or more: what enters the nozzle then shares no node with what has left.
 
@@ -132,6 +132,11 @@ class Inlet(eqx.Module):
     ) -> tuple[Scene, Particles, Any]:
         """The particles with the stock where it is at time t."""
         del dt
+        require(
+            self.first + self.stock.count <= particles.count,
+            f"An Inlet's stock of {self.stock.count} particles from number {self.first} on must be among the "
+            f"{particles.count} of the run: join inlet.particles() to the others, and give its `first`.",
+        )
         x, v, there, free = self._pushed(t)
         rows = slice(self.first, self.first + self.stock.count)
 
@@ -183,7 +188,8 @@ class Outlet(eqx.Module):
     ) -> tuple[Scene, Particles, Any]:
         """The particles without mass where they are taken."""
         del dt
-        x = particles.x
+        x, d = particles.x, self.region.dim
+        require(d == particles.dim, f"An Outlet's region must have {particles.dim} coordinates, as the run, got {d}.")
         taken = (self.region.contains(x) & (t >= self.start)) | (particles.mass == 0)
         none = jnp.zeros_like(particles.mass)
         rest = jnp.asarray(self.region.middle() if self.rest is None else self.rest, x.dtype)

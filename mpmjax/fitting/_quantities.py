@@ -90,7 +90,8 @@ class Markers(eqx.Module):
 
 
 class Extent(eqx.Module):
-    """How far the particles reach: a front, or a height [m]; its derivative is that of the farthest particle."""
+    """How far the particles that have mass reach: a front, or a height [m]; its derivative is that of the farthest
+    one."""
 
     axis: int = eqx.field(static=True)  # the direction
     side: Literal["upper", "lower"] = eqx.field(static=True, default="upper")
@@ -103,8 +104,10 @@ class Extent(eqx.Module):
         """The coordinate [m]."""
         del scene
         require(0 <= self.axis < particles.dim, f"Extent's axis must be below {particles.dim}, got {self.axis}.")
-        along = particles.x[:, self.axis]
-        return along.max() if self.side == "upper" else along.min()
+        along, there = particles.x[:, self.axis], particles.mass > 0
+        if self.side == "upper":
+            return along.max(where=there, initial=-jnp.inf)
+        return along.min(where=there, initial=jnp.inf)
 
 
 class CentreOfMass(eqx.Module):

@@ -198,12 +198,16 @@ def at(tree: Any, index: int | slice) -> Any:
 
 def _first(run: Problem, begin: RolloutState, fields: Sequence[str]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """A run's description, and the rows of a frame of its state at the beginning. Of a control, which may be any
-    function, the description has the name and a checksum of its numbers."""
+    function, the description has the name, a checksum of its numbers and one of its first memory."""
+
+    def numbers(tree: Any) -> str:
+        leaves = list(map(np.asarray, jax.tree.leaves(eqx.filter(tree, eqx.is_array))))
+        return f"{checksum({str(i): a for i, a in enumerate([*leaves, *(np.array(a.shape) for a in leaves)])}):08x}"
+
     control = None if begin.particles.mass is None else "unknown"
     if run.control is not None:
-        numbers = jax.tree.leaves(eqx.filter(run.control, eqx.is_array))
         name = getattr(run.control, "__qualname__", type(run.control).__qualname__)
-        control = f"{name} {checksum({str(i): np.asarray(a) for i, a in enumerate(numbers)}):08x}"
+        control = f"{name} {numbers(run.control)} with memory {numbers(run.memory)}"
     rows = _rows(run, fields, 0, 0, begin, no_steps(run.particles.x.dtype))
     return describe(run) | {"control": control}, rows
 

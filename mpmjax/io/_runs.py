@@ -112,7 +112,7 @@ def record(
         resume: continue from the last frame in the file up to t1. Where that is reached already, nothing is done.
         progress: show a progress bar on standard error.
         control, memory: as in `simulate`. Each frame has the memory; a run is resumed with the control and memory that
-            it began with, of which the file knows the name and a checksum of the arrays that an `equinox.Module` has.
+            it began with, of which the file knows the control's name and a checksum of the arrays of each.
 
     Returns:
         the run without its frames, which are in the file.

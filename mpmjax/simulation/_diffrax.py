@@ -116,13 +116,21 @@ class Problem(eqx.Module):
         before = self.scene, self.at(y.particles), y.memory
         after = self.control(*before[:2], (self.start + step) * self.dt, self.dt, y.memory)
         after = canonical(after, y.particles.x.dtype)
-        alike = isinstance(after, tuple) and eqx.tree_equal(*(jax.tree.map(jnp.shape, a[1:]) for a in (before, after)))
+        whole = isinstance(after, tuple) and len(after) == 3 and isinstance(after[0], Scene)
+        require(whole, f"A control must return (scene, particles, memory), got {shortened(str(after))}.")
+        asked, new = ({"particles": q, "memory": m} for _, q, m in (before, after))
         require(
-            alike and isinstance(after[0], Scene),
-            "A control must return (scene, particles, memory), particles and memory of the structure and shapes that "
-            f"it was given, here {shortened(str(jax.tree.map(jnp.shape, y.memory)))} of the memory.",
+            bool(eqx.tree_equal(jax.tree.map(jnp.shape, asked), jax.tree.map(jnp.shape, new))),
+            "A control must return particles and memory of the structure and shapes that it was given"
+            + _first_difference(asked, new),
         )
         scene, particles, memory = after
+        fixed = [([type(a) for a in (*s.boundary, *s.loads, *s.laws)], s.grid.shape) for s in (self.scene, scene)]
+        require(
+            fixed[0] == fixed[1],
+            "A control must return a scene with the boundaries, loads, laws and grid that it was given, and may change "
+            "their numbers only.",
+        )
         state = replace(state_of(particles), mass=particles.mass, volume=particles.volume)
         return replace(self, scene=scene), replace(y, particles=state, memory=memory)
 
@@ -140,6 +148,14 @@ class Problem(eqx.Module):
         state, order = resorted(y.order, self.scene, self.particles, y.particles, t, step, self.save_every)
         scene, particles = order.put_into(self.scene, self.particles)
         return replace(self, scene=scene, particles=particles), replace(y, particles=state, order=order)
+
+
+def _first_difference(asked: Any, new: Any) -> str:
+    """The end of a message that says which leaf of two trees is not alike."""
+    name = partial(jax.tree_util.keystr, simple=True, separator=".")
+    a, b = ({name(path): np.shape(x) for path, x in jax.tree_util.tree_leaves_with_path(t)} for t in (asked, new))
+    where = next((key for key in {**a, **b} if a.get(key) != b.get(key)), None)
+    return "." if where is None else f": {where} has shape {b.get(where)} and had {a.get(where)}."
 
 
 def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, Bool[Array, "p"]]:

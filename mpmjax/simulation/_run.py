@@ -205,11 +205,6 @@ class Run(eqx.Module):
     memory: Any = None
     final_memory: Any = None
 
-    memory: Any = None
-    """The memory of the run's control at each saved frame, with a leading axis f; of a run from a file its arrays."""
-    final_memory: Any = None
-    """The memory of the control at the end, with which another run goes on."""
-
     @property
     def times(self) -> Float[Array, "*f"]:
         """Time of each saved frame [s], shape (f,)."""

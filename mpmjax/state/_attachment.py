@@ -200,7 +200,8 @@ def _positions(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, 
         place.dim == particles.dim,
         f"{type(place).__name__} must have {particles.dim} coordinates, as the particles have, got {place.dim}.",
     )
-    return np.asarray(particles.x, float), float(np.median(np.asarray(particles.volume)) ** (1 / particles.dim))
+    volume = np.asarray(particles.volume)
+    return np.asarray(particles.x, float), float(np.median(volume[volume > 0]) ** (1 / particles.dim))
 
 
 def _nearest(x: np.ndarray, positions: np.ndarray, apart: float, place: AbstractPlace) -> np.ndarray:

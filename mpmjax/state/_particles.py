@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Deformation, ParticleMatrix, ParticleScalar, ParticleVector, components
+from mpmjax._types import Array, Deformation, ParticleMatrix, ParticleScalar, ParticleVector, Scalar, components
 from mpmjax.checks import checked, is_traced, require, require_fields, require_finite, require_that
 
 Deformations = tuple[Float[Array, "..."] | None, ...]
@@ -262,16 +262,21 @@ def history_arrays(held: Particles | State) -> list[tuple[str, slice, Any]]:
     ]
 
 
-_DUST = 2.0**-80  # below the rounding of any sum over particles
+def dusted(a: ParticleScalar, otherwise: Scalar = 1.0) -> ParticleScalar:
+    """Masses or volumes, where they are zero the square of the precision's rounding of their largest, or of another
+    where all are zero: below the rounding of sums over particles, above the smallest numbers."""
+    most = jax.lax.stop_gradient(a.max(initial=0))
+    return jnp.where(a > 0, a, jnp.finfo(a.dtype).eps ** 2 * jnp.where(most > 0, most, otherwise))
 
 
 def with_dust(particles: Particles) -> Particles:
-    """The particles, with those that have no mass as dust of about the others' density: no quotient is then 0/0, and
-    all sums stay as they are to the last digit."""
+    """The particles, with those that have no mass as dust of about the density of others of their material: no quotient
+    is then 0/0, and all sums stay as they are to the last digit."""
 
     def some(a: ParticleScalar) -> ParticleScalar:
         most = jax.lax.stop_gradient(a.max())
-        return jnp.where(a > 0, a, _DUST * jnp.where(most > 0, most, 1))
+        most = jnp.where(most > 0, most, 1)
+        return jnp.concatenate([dusted(a[slice(*group.rows)], most) for group in particles.groups])
 
     return eqx.tree_at(lambda q: (q.mass, q.volume), particles, (some(particles.mass), some(particles.volume)))
 

@@ -38,7 +38,7 @@ from mpmjax.state._axis import check_axis, with_axis
 from mpmjax.state._constraint import AbstractConstraint
 from mpmjax.state._loads import AbstractBodyForce, AbstractLoad
 from mpmjax.state._material_points import AveragedVolume, MaterialPoints, VolumeAverage, volume_average
-from mpmjax.state._particles import Particles, State, with_state
+from mpmjax.state._particles import Particles, State, dusted, with_state
 
 
 class AbstractDescription(eqx.Module):
@@ -298,7 +298,7 @@ class Scene(eqx.Module):
         images = mirror(self.boundary, grid, window).without_ties()
 
         def average(points: MaterialPoints) -> VolumeAverage:
-            return volume_average(grid, window, positions[slice(*points.rows)], points.volume, images)
+            return volume_average(grid, window, positions[slice(*points.rows)], dusted(points.volume), images)
 
         return tuple(replace(q, average=average(q)) if averaged.covers(i) else q for i, q in enumerate(materials))
 

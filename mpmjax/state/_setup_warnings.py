@@ -37,9 +37,12 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
     boundary, total = scene.boundary, scene.total
     grid = jax.tree.map(np.asarray, scene.grid.with_layers(1))  # all bodies' nodes coincide
     dx, free, d = float(grid.spacing), np.asarray(grid.periodic), grid.dim
-    x, volume = np.asarray(particles.x), np.asarray(particles.volume)
+    there = np.flatnonzero(np.asarray(particles.mass) > 0)
+    if not there.size:
+        return
+    x, volume = (np.asarray(a)[there] for a in (particles.x, particles.volume))
     resting = tuple(c.rests(total=total) and not grid.follow for c in boundary)
-    inputs = boundary, grid, particles.x, particles.volume, resting, total
+    inputs = boundary, grid, jnp.asarray(x), jnp.asarray(volume), resting, total
     some = jax.tree.leaves(eqx.filter_eval_shape(_probe, *inputs))  # none, and no compiling, of walls
     within, touched = eqx.filter_jit(_probe)(*inputs) if some else ([None] * len(boundary),) * 2
     first = (np.asarray(grid.origin) - 1) * dx
@@ -52,13 +55,13 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
             inside = np.any(beyond, axis=0).sum()
         if inside and condition.pushes:
             warn(
-                f"{inside} of {particles.count} particles lie in or beyond the {name} at the start, or nearer to it "
+                f"{inside} of {len(x)} particles lie in or beyond the {name} at the start, or nearer to it "
                 "than a quarter of their width: it pushes their faces away, half a width before their centres. Move "
                 "one of them."
             )
         elif inside:
             warn(
-                f"{inside} of {particles.count} particles lie in or beyond the {name} at the start: nodes there do "
+                f"{inside} of {len(x)} particles lie in or beyond the {name} at the start: nodes there do "
                 "not move freely. Move one of them; to hold a body on purpose take a Grip."
             )
         if any(law.flows for law in scene.laws) and (told := _unfit_for_fluids(condition, dx)):
@@ -66,7 +69,7 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
         if mask is not None:
             may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
             if not may_meet:  # only the nodes in a particle's stencil
-                first_nodes = np.asarray(_base(scene.kernel, grid, particles.x))
+                first_nodes = np.asarray(_base(scene.kernel, grid, jnp.asarray(x)))
                 reached = np.zeros(grid.shape, dtype=bool)
                 for offset in itertools.product(range(scene.kernel.order + 1), repeat=d):
                     reached[tuple(((first_nodes + offset) % grid.shape).T)] = True
@@ -91,7 +94,9 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
         )
     side = volume ** (1 / d)
     for number, group in enumerate(particles.groups, 1):
-        rows = slice(*group.rows)
+        rows = slice(*np.searchsorted(there, group.rows))
+        if rows.start == rows.stop:
+            continue
         half = side[rows, None] / 2
         lower, upper = (x[rows] - half).min(axis=0), (x[rows] + half).max(axis=0)
         for axis in range(d):
@@ -129,6 +134,8 @@ def warn_of_crowding(scene: Scene, particles: Particles) -> None:
     volume of each particle by itself, and not that they crowd."""
     undeformed = np.asarray(scene.grid.section(particles.x, particles.volume), float)
     volume = undeformed * np.concatenate(_ratios(scene.laws, particles))
+    if not undeformed.any():
+        return
     side = float(undeformed.max()) ** (1 / particles.dim)
     for offset in (0.0, 0.5):  # a layer between two rows of nodes shows less
         filled = _filled(np.asarray(particles.x), volume, max(float(scene.grid.spacing), 2 * side), offset)

@@ -153,9 +153,10 @@ def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator,
         UnknownBoundError: an integrator, transfer, gradient operator or term gives no bound.
     """
     scene, method, t = canonical((scene, method, t), particles.x.dtype)
+    particles = particles if is_prepared(scene, particles) else prepare(scene, particles)
     if not is_traced(particles.mass) and not np.all(np.asarray(particles.mass)):
         particles = with_dust(particles)
-    return _limit(scene, particles if is_prepared(scene, particles) else prepare(scene, particles), method, t)
+    return _limit(scene, particles, method, t)
 
 
 @eqx.filter_jit

@@ -105,7 +105,7 @@ def render(
     from matplotlib import cm, colormaps, colors, pyplot as plt  # here: it takes a second that only pictures should pay
 
     bar = None
-    if colour is not None:
+    if colour is not None and there.any():
         least, most = np.nanmin(values), np.nanmax(values)
         low, high = (least, most) if colour in _COUNTED else np.nanpercentile(values, (1, 99))
         low, high = (low, high) if low < high else (least, most)
@@ -145,6 +145,14 @@ def _volume(run: Run) -> np.ndarray:
     assert run.frames is not None
     changing = run.frames.volume
     return np.asarray(run.final.volume if changing is None else np.asarray(changing).max(axis=0), float)
+
+
+def _places(run: Run) -> np.ndarray:
+    """Where particles are in any frame [m], (n, d), without those that have no mass then."""
+    assert run.frames is not None
+    x = np.asarray(run.frames.x, float)
+    there = np.ones(x.shape[:2], bool) if run.frames.mass is None else np.asarray(run.frames.mass) > 0
+    return x[there] if there.any() else x.reshape(-1, x.shape[-1])
 
 
 def _colour_of(material: int, d: int) -> tuple[float, float, float]:
@@ -220,8 +228,8 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
     assert run.frames is not None
     turn = _upright(run.scene)
     volume = _volume(run)
-    size = float(volume.mean()) ** (1 / 3)
-    x = np.asarray(run.frames.x, float).reshape(-1, 3)
+    size = float(volume.sum() / max(np.count_nonzero(volume), 1)) ** (1 / 3)
+    x = _places(run)
     lower, upper = x.min(axis=0) - size, x.max(axis=0) + size
     extent = float((upper - lower).max())
     room, spacing = (lower - extent / 2, upper + extent / 2), max(size, extent / 50)
@@ -286,11 +294,15 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
 
     def draw(particles: Particles, values: np.ndarray, t: float) -> list[Any]:
         x, (rock, normal) = np.asarray(particles.x, float) @ turn.T, stones(t)
-        normals = np.concatenate([_outward(x, volume), normal])
+        there = np.asarray(particles.mass) > 0
+        outward = np.zeros_like(x)
+        if there.any():
+            outward[there] = _outward(x[there], volume[there])
+        normals = np.concatenate([outward, normal])
         facing = (normals @ light)[:, None]
         colour = np.concatenate([_tinted(particles, bar, values), np.tile(STONE, (len(rock), 1))])
         colour = np.clip(colour * np.where(facing > 0, 0.75 + 0.3 * facing, 0.75 + 0.4 * facing), 0, 1)
-        wide = np.concatenate([diameter * (np.asarray(particles.mass) > 0), np.full(len(rock), 3 * spacing)])
+        wide = np.concatenate([diameter * there, np.full(len(rock), 3 * spacing)])
         every = np.concatenate([x, rock])
         shadow = np.column_stack([every[:, :2], np.full(len(every), ground)])
         metre = float(np.linalg.norm(np.diff(on_paper(ends)[0], axis=0))) / (2 * size)  # in pixels, at the middle
@@ -342,8 +354,8 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
         """Points with those on the other side of the axis of a body of revolution."""
         return np.concatenate([x, x * (-1, 1)]) if grid.axisymmetric else x
 
-    x = whole(np.asarray(run.frames.x).reshape(-1, d))
-    margin = float(volume.mean()) ** (1 / d)
+    x = whole(_places(run))
+    margin = float(volume.sum() / max(np.count_nonzero(volume), 1)) ** (1 / d)
     lower, upper = x.min(axis=0) - 2 * margin, x.max(axis=0) + 2 * margin
     extent = float((upper - lower).max())
     walls = [wall for boundary in run.scene.boundary for wall in boundary.walls()]
