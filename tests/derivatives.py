@@ -14,7 +14,7 @@ from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, PLASTIC, RUBBER, VISCOUS, blo
 
 import mpmjax as mpm
 from mpmjax.boundary._contact import ConstrainedNodes
-from mpmjax.simulation import _simulate
+from mpmjax.state import state_of, with_state
 from mpmjax.stepping import _step
 
 TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-14)  # that is, down to rounding: central differences see every digit
@@ -135,21 +135,21 @@ def rolled(q: dict[str, Any], case: Case, steps: int = STEPS) -> tuple[jax.Array
 
     def spy(held: Any, v: Any, momentum_residual: Any) -> Any:
         after = friction(held, v, momentum_residual)
-        seen.append((jnp.stack(held.active, axis=1), (v != 0) & (after[0] == 0)))
+        seen.append((jnp.concatenate([part.ravel() for part in held.active]), (v != 0) & (after[0] == 0)))
         return after
 
     def body(state: Any, n: Any) -> Any:
-        new, _ = _step.step_unchecked(scene, _simulate.with_state(particles, state), n * DT, jnp.asarray(DT), method)
+        new, _ = _step.step_unchecked(scene, with_state(particles, state), n * DT, jnp.asarray(DT), method)
         # what a return map changes is seen in the history, beyond the rounding of what a grip carries on its yield
         # condition, or where there is none in J = 1
         grown = jax.tree.map(lambda a, b: jnp.abs(a - b) > 1e-12, new.history, state.history)
         yielded = grown if case.law in PLASTIC else [new.F == 1] * (case.law in KINKED)
-        return _simulate.state_of(new), jax.tree.leaves((seen.pop() if seen else (), yielded))
+        return state_of(new), jax.tree.leaves((seen.pop() if seen else (), yielded))
 
     friction = ConstrainedNodes.friction
     with mock.patch.object(ConstrainedNodes, "friction", spy):
-        final, branches = jax.lax.scan(body, _simulate.state_of(particles), jnp.arange(float(steps)))
-    return outcome(_simulate.with_state(particles, final)), branches
+        final, branches = jax.lax.scan(body, state_of(particles), jnp.arange(float(steps)))
+    return outcome(with_state(particles, final)), branches
 
 
 def quickly_compiled(f: Any) -> Any:
