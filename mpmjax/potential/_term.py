@@ -140,7 +140,7 @@ class AbstractTerm(eqx.Module):
         """z [1/s²] and y [1/s] of each particle, or numbers, that energy and resistance add to the left side of the
         bound Δt² z + Δt y ≤ 4 of `stable_dt`. Default: None, for which `stable_dt` raises.
 
-        Of a spring k or a dashpot c at an arm r from a particle of mass m z = 2 k (1 + A r²)/m, y = 4 c (1 + A r²)/m.
+        A spring k to the ground at an arm r of a mass m has z = 2 k (1 + A r²)/m, a dashpot c y = 4 c (1 + A r²)/m.
 
         Args:
             mass: masses of the particles m [kg], shape (p,).
