@@ -8,29 +8,17 @@ import numpy as np
 
 
 class Estimate(NamedTuple):
-    """A fitted number, or one that follows from those.
+    """A fitted number, or one that follows from those."""
 
-    Attributes:
-        label: the name of the parameter, with the index of an array.
-        value: the fitted value.
-        error: standard error, of the noise and of what the misfit shows (see `fit`).
-        interval: where it lies at the level of the fit.
-        unit: as the parameter says it.
-        start: the first guess.
-        at_bound: whether it came to lie at a bound, where errors mean little.
-        noise_error: standard error that the noise alone makes.
-        noise_interval: where it lies by the noise alone.
-    """
-
-    label: str
-    value: float
-    error: float
-    interval: tuple[float, float]
-    unit: str = ""
-    start: float = np.nan
-    at_bound: bool = False
-    noise_error: float = np.nan
-    noise_interval: tuple[float, float] = (np.nan, np.nan)
+    label: str  # the name of the parameter, with the index of an array
+    value: float  # the fitted value
+    error: float  # standard error, of the noise and of what the misfit shows (see `fit`)
+    interval: tuple[float, float]  # where it lies at the level of the fit
+    unit: str = ""  # as the parameter says it
+    start: float = np.nan  # the first guess
+    at_bound: bool = False  # whether it came to lie at a bound, where errors mean little
+    noise_error: float = np.nan  # standard error that the noise alone makes
+    noise_interval: tuple[float, float] = (np.nan, np.nan)  # where it lies by the noise alone
 
     @property
     def name(self) -> str:
@@ -44,27 +32,16 @@ class Estimate(NamedTuple):
 
 
 class NoiseEstimate(NamedTuple):
-    """The noise of an observation.
+    """The noise of an observation."""
 
-    Attributes:
-        name: the name of the observation.
-        sigma: standard deviation, the root mean square where it varies, in the data's unit.
-        estimated: whether the fit estimated it.
-        misfit: root mean square of the residuals, in units of σ.
-        points: how many numbers were measured.
-        worth: how many independent numbers they are worth, by the correlation of their residuals.
-        shape: the shape of the residuals, "a ramp", "drifts" or "correlated"; empty where they have none.
-        is_beyond: whether the misfit is beyond the noise: by χ² where that is given, by the shape where it is not.
-    """
-
-    name: str
-    sigma: float
-    estimated: bool
-    misfit: float
-    points: int
-    worth: float
-    shape: str
-    is_beyond: bool
+    name: str  # the name of the observation
+    sigma: float  # standard deviation, the root mean square where it varies, in the data's unit
+    estimated: bool  # whether the fit estimated it
+    misfit: float  # root mean square of the residuals, in units of σ
+    points: int  # how many numbers were measured
+    worth: float  # how many independent numbers they are worth, by the correlation of their residuals
+    shape: str  # the shape of the residuals, "a ramp", "drifts" or "correlated"; empty where they have none
+    is_beyond: bool  # whether the misfit is beyond the noise: by χ² where that is given, by the shape where it is not
 
 
 class AbstractFit(eqx.Module):

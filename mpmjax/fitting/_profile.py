@@ -21,36 +21,22 @@ class Profile(eqx.Module):
     """How the misfit grows when one parameter is held at other values and all others are fitted anew.
 
     `print(profile)` says its interval.
-
-    Attributes:
-        label: the parameter.
-        unit: the unit of the parameter.
-        values: values of the parameter, growing, shape (p,); the fit's is among them.
-        statistic: Δχ² = Σ r² there less that of the fit, in units of the noise, shape (p,).
-        numbers: all fitted numbers along it, one a column in the order of `labels`, shape (p, n).
-        labels: names of the fitted numbers.
-        estimate: the value of the fit.
-        symmetric: the interval of the standard error.
-        interval: where Δχ² is below the threshold. An end that was not found is the parameter's bound, or infinite.
-        threshold: Δχ² at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν), or more.
-        degrees_of_freedom: ν of the noise's estimate; infinite where it was given.
-        level: the level of the interval [-], such as 0.95.
-        warnings: where it ends without an end of the interval, in words.
     """
 
-    label: str
-    unit: str
-    values: np.ndarray
-    statistic: np.ndarray
-    numbers: np.ndarray
-    labels: tuple[str, ...]
-    estimate: float
-    symmetric: tuple[float, float]
+    label: str  # the parameter
+    unit: str  # the unit of the parameter
+    values: np.ndarray  # values of the parameter, growing, shape (p,); the fit's is among them
+    statistic: np.ndarray  # Δχ² = Σ r² there less that of the fit, in units of the noise, shape (p,)
+    numbers: np.ndarray  # all fitted numbers along it, one a column in the order of `labels`, shape (p, n)
+    labels: tuple[str, ...]  # names of the fitted numbers
+    estimate: float  # the value of the fit
+    symmetric: tuple[float, float]  # the interval of the standard error
     interval: tuple[float, float]
-    threshold: float
-    degrees_of_freedom: float
-    level: float
-    warnings: tuple[str, ...]
+    """Where Δχ² is below the threshold. An end that was not found is the parameter's bound, or infinite."""
+    threshold: float  # Δχ² at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν), or more
+    degrees_of_freedom: float  # ν of the noise's estimate; infinite where it was given
+    level: float  # the level of the interval [-], such as 0.95
+    warnings: tuple[str, ...]  # where it ends without an end of the interval, in words
 
     @property
     def signed_root(self) -> np.ndarray:

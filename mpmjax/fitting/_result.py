@@ -33,55 +33,32 @@ from mpmjax.state import warn_of_rounding
 
 
 class FitResult(AbstractFit):
-    """Fitted parameters, their errors, and the fitted scene.
+    """Fitted parameters, their errors, and the fitted scene."""
 
-    Attributes:
-        problem: the residuals that were made small.
-        z: the coordinates at the minimum [-], shape (n,).
-        sigmas: the noise of each observation, given or estimated, in the data's unit.
-        residuals: residuals of all observations, then of priors, in units of their noise [-], shape (m,).
-        jacobian: their derivative by the coordinates, shape (m, n).
-        uncertainty: covariance of the coordinates, and the directions that the data do not see.
-        estimates: the fitted numbers, one for each entry of each parameter.
-        reported: the estimates that `report` asked for.
-        chi_squared: Σ r², priors included.
-        degrees_of_freedom: measured numbers and priors, less parameters.
-        noise: the noise of each observation.
-        experiments: the experiments with the fitted values.
-        runs: their runs, without what was observed, where the search made them; else empty.
-        level: the level of the intervals [-], such as 0.95.
-        optimiser: the method of the search.
-        converged: whether the search met its tolerance.
-        history: the iterations of the search.
-        warnings: directions that the data do not see, and a misfit that the noise does not explain, in words.
-        interrupted: whether Ctrl-C ended it.
-        moved: how far z moves on twice the spacing, then with twice the step, shape (2, n); or why that is not known.
-        screening: the other points from which the minimum was searched, if it was.
-        remarks: how its start was come by, in words.
-    """
-
-    problem: FitProblem
-    z: np.ndarray
-    sigmas: Sigmas
-    residuals: np.ndarray
-    jacobian: np.ndarray
-    uncertainty: Uncertainty
-    estimates: tuple[Estimate, ...]
-    reported: tuple[Estimate, ...]
-    chi_squared: float
-    degrees_of_freedom: int
-    noise: tuple[NoiseEstimate, ...]
-    experiments: tuple[Experiment, ...]
-    runs: tuple[Run, ...]
-    level: float
-    optimiser: AbstractOptimiser
-    converged: bool
-    history: tuple[Iteration, ...]
+    problem: FitProblem  # the residuals that were made small
+    z: np.ndarray  # the coordinates at the minimum [-], shape (n,)
+    sigmas: Sigmas  # the noise of each observation, given or estimated, in the data's unit
+    residuals: np.ndarray  # residuals of all observations, then of priors, in units of their noise [-], shape (m,)
+    jacobian: np.ndarray  # their derivative by the coordinates, shape (m, n)
+    uncertainty: Uncertainty  # covariance of the coordinates, and the directions that the data do not see
+    estimates: tuple[Estimate, ...]  # the fitted numbers, one for each entry of each parameter
+    reported: tuple[Estimate, ...]  # the estimates that `report` asked for
+    chi_squared: float  # Σ r², priors included
+    degrees_of_freedom: int  # measured numbers and priors, less parameters
+    noise: tuple[NoiseEstimate, ...]  # the noise of each observation
+    experiments: tuple[Experiment, ...]  # the experiments with the fitted values
+    runs: tuple[Run, ...]  # their runs, without what was observed, where the search made them; else empty
+    level: float  # the level of the intervals [-], such as 0.95
+    optimiser: AbstractOptimiser  # the method of the search
+    converged: bool  # whether the search met its tolerance
+    history: tuple[Iteration, ...]  # the iterations of the search
     warnings: tuple[str, ...]
-    interrupted: bool = False
+    """Directions that the data do not see, and a misfit that the noise does not explain, in words."""
+    interrupted: bool = False  # whether Ctrl-C ended it
     moved: np.ndarray | str | None = None
-    screening: Screening | None = None
-    remarks: tuple[str, ...] = ()
+    """How far z moves on twice the spacing, then with twice the step, shape (2, n); or why that is not known."""
+    screening: Screening | None = None  # the other points from which the minimum was searched, if it was
+    remarks: tuple[str, ...] = ()  # how its start was come by, in words
 
     @property
     def values(self) -> dict[str, np.ndarray]:
