@@ -16,11 +16,12 @@ import numpy as np
 from mpmjax._types import Scalar
 from mpmjax.checks import checked, require, warn
 from mpmjax.fitting._discretisation import changes_on_coarse_grid
+from mpmjax.fitting._estimate import table
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._log import recorded
 from mpmjax.fitting._optimiser import LBFGS, LevenbergMarquardt
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem, Sigmas, table
+from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._result import FitResult, Noise, fit_result, settle_noise
 from mpmjax.fitting._search import (
     NO_DERIVATIVE,

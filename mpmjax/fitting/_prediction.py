@@ -11,10 +11,10 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
-from mpmjax.fitting._estimate import AbstractFit, Estimate
+from mpmjax.fitting._estimate import VALUE, AbstractFit, Estimate, table
 from mpmjax.fitting._experiment import Experiment, Numbers
 from mpmjax.fitting._fit import checked_level
-from mpmjax.fitting._problem import Coordinates, FitProblem, linearised, table
+from mpmjax.fitting._problem import Coordinates, FitProblem, linearised
 from mpmjax.fitting._result import FitResult
 from mpmjax.fitting._search import AbstractOptimiser, batch_size, counted, search_many
 from mpmjax.fitting._uncertainty import Prediction, banded
@@ -170,7 +170,7 @@ class Bootstrap(AbstractFit):
 
     def __str__(self) -> str:
         """A table."""
-        head = "", f"{'value':>12} ± {'error':<9}", f"{100 * self.level:g} % interval"
+        head = "", VALUE.format("value"), f"{100 * self.level:g} % interval"
         last = f"{len(self.samples)} fits of data drawn anew" + (f", {self.failed} failed" if self.failed else "")
         return "\n".join([*table(head, *((e.name, *e.cells) for e in self.estimates)), last])
 

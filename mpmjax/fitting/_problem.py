@@ -324,15 +324,7 @@ def in_batches(function: Callable[[Any], tuple[Any, Any]], units: Any, at_once: 
     return jax.tree.map(lambda a: a[0], once), jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], each)
 
 
-def table(head: Sequence[str], *rows: Sequence[str]) -> list[str]:
-    """The lines of a table, its columns as wide as they need."""
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-    widths[0] = max(widths[0], _FIRST_COLUMN)
-    return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]
-
-
 SHOWN = 4  # parameters that a line has room for
 ROW_COST = 1.2
 """Cost of a row of the Jacobian by reverse mode, over that of a column by forward mode (benchmarks/fit_cost.py)."""
 _COPIES = 16  # memory that a tangent takes, in sizes of the particles' (benchmarks/fit_cost.py)
-_FIRST_COLUMN = 24

@@ -11,9 +11,10 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Int, Scalar
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_whole
+from mpmjax.fitting._estimate import table
 from mpmjax.fitting._evaluation import costs_at
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas, table
+from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas
 from mpmjax.fitting._search import AbstractOptimiser, Search, batch_size, counted, search_many
 
 Ends = list[tuple[Search, list[int]]]  # minima, with the numbers of the points that led there
