@@ -17,7 +17,7 @@ from mpmjax.analysis import sensitivity
 from mpmjax.checks import checked, require, require_positive, warn
 from mpmjax.fitting._estimate import VALUE, AbstractFit, Estimate, NoiseEstimate, table
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._fit import chosen_optimiser, fit, require_derivative
+from mpmjax.fitting._fit import chosen_optimiser, fit, require_end
 from mpmjax.fitting._observation import Series
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
@@ -101,9 +101,7 @@ def fit_staged(
         if [e.steps for e in cut.experiments] == [e.steps for e in whole.experiments]:
             break
         minimum = search(cut, optimiser, z, cut.first_sigmas)
-        if minimum.interrupted:
-            raise KeyboardInterrupt
-        require_derivative(minimum)
+        require_end(minimum)
         if minimum.failure:
             cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
         z, misfit, count = minimum.z, cut.misfit(minimum.cost), len(minimum.history)
