@@ -82,11 +82,9 @@ def profile(
     neither symmetric nor finite. In a linear problem both are one.
 
     From the estimate it goes to either side in steps of equal growth of √Δχ². Where the threshold is never reached the
-    interval is open, and where Δχ² jumps over it, as a simulation does beyond its stable step, it ends there: a warning
-    says so. One program is compiled for all points, and for all numbers of a fit.
-
-    The noise is held at what the fit found. Where the fit's misfit is beyond it, the threshold is larger by the square
-    of what errors are (see `fit`). With a robust or weighted observation it is approximate.
+    interval is open, and where Δχ² jumps over it, as beyond a stable step, it ends there: a warning says so. The noise
+    is the fit's; where the misfit is beyond it, the threshold is larger by the square of what errors are. With a robust
+    or weighted observation it is approximate. One program is compiled for all numbers of a fit.
 
     Args:
         result: the fit.

@@ -225,22 +225,20 @@ def fit_refined(
 
         print(mpm.fitting.fit_refined(build, {"E": ...}))
 
-    With estimates a and b on the two finest grids, logarithms of `Positive` parameters, and their spacings in the
-    ratio r, the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and the standard error that is left of
-    the discretisation is taken as that whole correction. p is `order`; with three grids of equal ratios it is what
-    they show, between half and twice that. A higher order than `order` may be shown by grids that are too coarse to
-    tell, so the error then is the correction by `order`. Where the estimates do not converge, or one lies at its
-    bound, which tells nothing of where it would be without, the finest stays, with its last change as the error, and
-    a warning says so.
+    With estimates a and b on the two finest grids, logarithms of `Positive` parameters, and spacings in the ratio r,
+    the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and that whole correction is taken as the standard
+    error that is left of the discretisation. p is `order`; with three grids of equal ratios it is what they show,
+    between half and twice that, but the error is no less than by `order`, for grids may be too coarse to tell. Where
+    the estimates do not converge, or one lies at its bound, the finest stays, with its last change as the error, and a
+    warning says so.
 
-    Two estimates may agree by chance and both be wrong, as where an error changes its sign between the grids. What the
-    finest grid misses of the data then tells more: D, in units of σ. A discretisation that changes predictions by D in
-    ways that no parameter can follow may change them as much in ways that a parameter does follow. The parameter that
-    makes up for it moves by D times its standard error from the noise; half of this is the least error that is taken.
-    D² is what the sum of squares loses from the grid before to the finest, over r^2p − 1, and needs no σ.
+    Two estimates may agree by chance and both be wrong. What the finest grid misses of the data then tells more: D, in
+    units of σ. A discretisation that changes predictions by D in ways that no parameter can follow may do as much in
+    ways that one does follow, which moves it by D times its standard error from the noise; half of this is the least
+    error that is taken. D² is what Σ r² loses from the grid before to the finest, over r^2p − 1, and needs no σ.
 
-    Intervals are made of the noise's and the discretisation's part, and keep to the bounds. After Ctrl-C it returns
-    what it has, and extrapolates from grids on which the fit was done.
+    Intervals hold the noise's and the discretisation's part, and keep to the bounds. After Ctrl-C it returns what it
+    has, and extrapolates from grids on which the fit was done.
 
     Args:
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
