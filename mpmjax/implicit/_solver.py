@@ -64,8 +64,8 @@ class ConjugateResidual(AbstractInnerProductSolver):
 
     Args:
         rtol: relative tolerance. Default: 1e-8 in float64, 1e-5 in float32; 1e-6 there as an adjoint solver.
-        increment_rtol: stop also when an increment is small, ‖α_k p_k‖² ≤ increment_rtol² ‖x‖² (the
-            alternative named after eq. 20 of the derivation). Default: not used. It says nothing of the residual.
+        increment_rtol: stop also when an increment is small, ‖α_k p_k‖² ≤ increment_rtol² ‖x‖². Default: not used. It
+            says nothing of the residual.
         max_steps: largest number of steps of the recurrence.
     """
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import as_plain, require, require_fields, require_finite, require_positive, require_that
-from mpmjax.linalg import PowerLessOne
+from mpmjax.linalg import PowerBeyondLine, PowerLessOne, exponential_beyond_line
 from mpmjax.material._differential import PrincipalDifferential
 from mpmjax.material._law import AbstractMaterial
 
@@ -39,7 +39,7 @@ class AbstractRubber(AbstractMaterial):
 
     def energy(self, F: Matrix) -> Array:
         J = la.determinant(F)
-        _, excess = self._strains(F, jnp.log(J))
+        excess = tuple(_second_order(a, F, jnp.log(J)) for a in self.powers())
         volumetric = self.bulk_modulus / 4 * (J**2 - 1 - 2 * jnp.log(J))
         return sum(self.work(excess), volumetric)
 
@@ -105,6 +105,15 @@ def _isochoric_power(exponent: PerParticle, F: Matrix, log_J: Array) -> Matrix:
 def _excess(exponent: PerParticle, trace: Array, log_J: Array, dim: int) -> Array:
     """E = λ̄_1^α + λ̄_2^α + λ̄_3^α − 3 [-], zero at rest, by the trace of `_isochoric_power` in the d directions of F."""
     return trace + (3 - dim) * jnp.expm1(-exponent / 3 * log_J)
+
+
+def _second_order(exponent: PerParticle, F: Matrix, log_J: Array) -> Array:
+    """E as of `_excess`, where α ln λ̄_i are left out, whose sum is zero: of full precision where α is near zero."""
+    if isinstance(exponent, int):
+        return _excess(exponent, la.trace(_isochoric_power(exponent, F, log_J)), log_J, len(F))
+    exponent = exponent * jnp.ones_like(log_J)
+    power = PowerBeyondLine(exponent / 2, -exponent / 3 * log_J)
+    return la.trace(power(la.matmul(la.transpose(F), F))) + (3 - len(F)) * exponential_beyond_line(power.shift)
 
 
 class MooneyRivlin(AbstractRubber):
