@@ -127,9 +127,8 @@ class Scene(eqx.Module):
         gravity: body acceleration [m/s²], (d,). Default: none.
         boundary: one boundary condition or several; where two prescribe the same component, the earlier holds.
         kernel: B-spline. Default: quadratic.
-        gradient: gradient operator of force and deformation. Default: the spline's in the total description with the
-            quadratic kernel, where stresses are of second order with it and of first with the other; else moving least
-            squares.
+        gradient: gradient operator of force and deformation. Default: the spline's in the total description, where
+            stresses have a higher order with it, else moving least squares.
         transfer: PIC, FLIP or APIC. Default: APIC.
         description: updated (default) or total Lagrangian.
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
@@ -189,8 +188,7 @@ class Scene(eqx.Module):
         if grid.axisymmetric:
             self.boundary = with_axis(self.boundary, grid)
         self.kernel = kernel
-        rough = description.total and kernel == BSpline(2)  # where moving least squares is
-        self.gradient = gradient or (SplineGradient() if rough else MLSGradient())
+        self.gradient = gradient or (SplineGradient() if description.total else MLSGradient())
         self.transfer, self.description = transfer, description
         self.body_force, self.boundary_forces = body_force, boundary_forces
         self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
