@@ -173,11 +173,11 @@ def test_a_change_is_made_at_its_place(folder):
 
 
 def test_options_of_run_stand_for_keys_of_the_file(folder, tmp_path):
-    options = ("--dt", 2e-3, "--steps", 4, "--method", "BackwardEuler", "--set", "material.youngs_modulus=2e5")
+    options = ("--dt", 2e-3, "--steps", 4, "--method", "Explicit", "--set", "material.youngs_modulus=2e5")
     code, _, err = shell("run", folder / "scene.toml", "-o", tmp_path / "run.h5", "--quiet", *options)
     assert code == 0, err
     run = mpm.load(tmp_path / "run.h5")
-    assert (float(run.dt), int(run.final_step), type(run.method)) == (2e-3, 4, mpm.BackwardEuler)
+    assert (float(run.dt), int(run.final_step), type(run.method)) == (2e-3, 4, mpm.Explicit)
     assert float(run.scene.material.youngs_modulus) == 2e5
 
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import thorough
 from test_fit import DT, NOISE, RATIO, experiment, tracks
 
 import mpmjax as mpm
@@ -126,7 +127,7 @@ def test_correlated_numbers_are_worth_what_theory_says():
     assert shape_of(common)[0] == pytest.approx(20, rel=0.2)
 
 
-@pytest.mark.parametrize("steps", [20, 80])
+@pytest.mark.parametrize("steps", [80, *thorough(20)])
 def test_the_first_interval_holds_what_the_grid_gets_wrong(both_grids, steps):
     """Of data made on a grid four times finer: that of the noise alone is many times too narrow."""
     times, fine = both_grids[4]

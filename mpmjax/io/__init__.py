@@ -11,6 +11,7 @@ from mpmjax.io._schema import (
     known_classes as known_classes,
     parameters_of as parameters_of,
     register as register,
+    require_keys as require_keys,
 )
 from mpmjax.io._transactional_file import (
     ReplacedFile as ReplacedFile,
