@@ -69,7 +69,6 @@ class AttachedPoints(AbstractPlace):
         return shape_of(self.offset)[1]
 
     def attached(self, particles: Particles) -> "AttachedPoints":
-        del particles
         return self
 
     def revolved(self, particles: Particles) -> "AttachedPoints":
@@ -168,11 +167,8 @@ class PointsAt(AbstractPlace):
         require_fields(self)
         shape = shape_of(self.positions)
         require(len(shape) == 2 and shape[0] > 0, f"PointsAt need positions of shape (s, d), got {shape}.")
-        require(
-            self.weights is None or shape_of(self.weights) == shape[:1],
-            f"PointsAt need one weight a position, got {self.weights}.",
-        )
         if self.weights is not None:
+            require(shape_of(self.weights) == shape[:1], f"PointsAt need one weight a position, got {self.weights}.")
             require_that(
                 "PointsAt's weights are shares of the load and must sum to one (divide them by their sum)",
                 lambda w: abs(w.sum() - 1) < _ROUNDED,

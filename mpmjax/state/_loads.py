@@ -49,7 +49,6 @@ class AbstractLoad(eqx.Module):
     def term(self, points: LoadedPoints, t: Scalar) -> AbstractTerm | None:
         """The term of the potential that it adds in a step, with the ground as at time t: part of implicit solves,
         `stable_dt` and budgets. Default: None."""
-        del points, t
         return None
 
     def check(self, dim: int) -> None:
@@ -92,7 +91,6 @@ class Traction(AbstractLoad):
         _check_dead_load("Traction's traction", self, self.traction, dim)
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
-        del dt
         return points.weight * value_at(self.traction, t)[:, None]
 
 
@@ -119,7 +117,6 @@ class PointLoad(AbstractLoad):
         _check_dead_load("PointLoad's total", self, self.total, dim)
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
-        del dt
         return points.weight * value_at(self.total, t)[:, None]
 
 
@@ -179,7 +176,6 @@ class Support(AbstractSpring):
         return Forces(nodes=self.points.nodal(amount, size))
 
     def diagonal(self, stencil: Stencil, size: int) -> Forces:
-        del stencil
         return Forces(nodes=self.points.diagonal(self.stiffness, size))
 
     @property

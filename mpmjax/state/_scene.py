@@ -283,17 +283,10 @@ class Scene(eqx.Module):
 
     def material_points(self, particles: Particles, t: Scalar = 0.0) -> tuple[MaterialPoints, ...]:
         """The materials of prepared particles at time t [s], with the elastic laws in force."""
-        materials = tuple(
-            MaterialPoints(
-                law=law.elastic(group.history),
-                volume=particles.volume[slice(*group.rows)],
-                deformation=group.deformation(),
-                total=self.total,
-                rows=group.rows,
-                viscosity=law.viscosity,
-            )
-            for law, group in zip(self.laws, particles.groups, strict=True)
-        )
+        materials = ()
+        for law, q in zip(self.laws, particles.groups, strict=True):
+            volume, elastic = particles.volume[slice(*q.rows)], law.elastic(q.history)
+            materials += (MaterialPoints(elastic, volume, q.deformation(), self.total, q.rows, law.viscosity),)
         if (averaged := self.volume) is None:
             return materials
         grid, window, positions = self.grid.with_layers(1), self.window(particles), self.on_grid(particles, t)
@@ -309,9 +302,9 @@ class Scene(eqx.Module):
         admits after a step dt [s]."""
         groups = zip(self.laws, particles.groups, strict=True)
         mapped = [law.return_map(group.deformation(), group.history, dt) for law, group in groups]
-        deformations = tuple(particle_first(deformation) for deformation, _ in mapped)
-        histories = tuple(history for _, history in mapped)
-        return with_state(particles, State(particles.x, particles.v, particles.C, deformations, histories))
+        deformations, histories = zip(*mapped, strict=True)
+        after = State(particles.x, particles.v, particles.C, tuple(map(particle_first, deformations)), histories)
+        return with_state(particles, after)
 
     @property
     def collider_count(self) -> int:
