@@ -38,7 +38,7 @@ class FitProblem(eqx.Module):
         parameters: Mapping[str, AbstractParameter],
         memory: int = 2**28,
     ):
-        self.memory = require_whole("memory [B]", memory, 1)
+        self.memory, self.plane = require_whole("memory [B]", memory, 1), None
         experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
         require(len(experiments) > 0, "A fit needs an experiment at least.")
         require(len(parameters) > 0, "A fit needs a parameter at least.")

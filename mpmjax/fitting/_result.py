@@ -75,6 +75,26 @@ class FitResult(AbstractFit):
         return self.problem.by_name(jnp.asarray(self.z, self.problem.dtype))
 
     @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the search's coordinates [-], shape (n, n)."""
+        return self.uncertainty.covariance
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Correlation of the estimates, shape (n, n)."""
+        return self.uncertainty.correlation
+
+    @property
+    def spectrum(self) -> np.ndarray:
+        """Eigenvalues of the Fisher information JᵀJ, growing, shape (n,): 1/√λ is how far the direction is open."""
+        return self.uncertainty.spectrum
+
+    @property
+    def directions(self) -> np.ndarray:
+        """Eigenvectors of the Fisher information, one a column, shape (n, n)."""
+        return self.uncertainty.directions
+
+    @property
     def all(self) -> tuple[Estimate, ...]:
         return (*self.estimates, *self.reported)
 
@@ -264,12 +284,13 @@ def fit_result(
         def value(z: Coordinates, of: Callable[[Experiment], Any] = of) -> Array:
             return jnp.asarray(of(problem.at(z)[0]))
 
-        number, start, parts = float(value(z)), float(value(jnp.zeros_like(z))), []
+        number, start, both = float(value(z)), float(value(jnp.zeros_like(z))), []
         for each in (errors, noise_alone):
             error, freedom = each.of(np.asarray(jax.jacfwd(value)(z), float))
             reach = float(quantile(level, freedom) * error)
-            parts += [float(error), (number - reach, number + reach)]
-        reported.append(Estimate(name, number, *parts[:2], "", start, False, *parts[2:]))
+            both.append((float(error), (number - reach, number + reach)))
+        (error, ends), by_noise = both
+        reported.append(Estimate(name, number, error, ends, "", start, False, *by_noise))
     degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
     texts = seen_together(problem.labels, errors, problem.logarithmic)
     result = FitResult(
