@@ -35,7 +35,7 @@ def save_scene(
     Arguments with their default are left out. Numbers come back bit for bit.
 
     Args:
-        path: the file to be, which must not be there.
+        path: the file to be, NAME.toml, which must not be there.
         scene: the scene, of the package's own classes and of registered ones.
         particles: the particles at the start, with all of their state.
         t1, dt, method, save_every: the `[run]` table, see `simulate`.
@@ -46,6 +46,7 @@ def save_scene(
         OSError: the disk refused.
     """
     path = Path(path)
+    require(path.suffix == ".toml", f"A scene file's name must end in .toml, got {path}.")
     start = path.with_suffix(".start.vtkhdf")
     require(
         not is_traced((scene, particles)), "A scene inside a jax transformation has no values yet: save it outside."

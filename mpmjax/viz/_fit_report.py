@@ -143,7 +143,7 @@ def _numbers(
 ) -> dict[str, Any]:
     observations = [o for e in measured or result.experiments for o in e.observations]
     predictions = predict_observations(result, measured or None) if predictions is None else predictions
-    plain = ("chi_squared", "p_value", "degrees_of_freedom", "level", "converged", "interrupted")
+    plain = ("correlation", "chi_squared", "p_value", "degrees_of_freedom", "level", "converged", "interrupted")
     bands = ("value", "error", "lower", "upper", "sigma", "new_lower", "new_upper")
     of_profile = ("label", "interval", "threshold", "degrees_of_freedom", "level", "warnings")
     return {
