@@ -20,7 +20,7 @@ from mpmjax.boundary._conditions import Conditions, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._surface_contact import Faces, Surface, surface_contact
 from mpmjax.discretisation import Grid
-from mpmjax.potential import Image, Mirror, MirrorPlace, Tie
+from mpmjax.potential import Image, Mirror, MirrorPlace, Tie, WallImage
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
@@ -53,7 +53,7 @@ class AbstractBoundary(eqx.Module):
     sees_faces: ClassVar[bool] = False
     """Whether its `contacts` need the faces of particles though it does not push."""
     sees_fluids: ClassVar[bool] = False
-    """Whether its `contacts` need the faces of particles where one flows."""
+    """Whether it has `fluid_walls`."""
     meets_constraints: ClassVar[bool] = True
     """Whether it may stand in a scene with constrained bodies, such as rigid ones. What it prescribes of a node it
     prescribes of the body."""
@@ -107,6 +107,12 @@ class AbstractBoundary(eqx.Module):
         if faces is None or not self.pushes:
             return ()
         return tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
+
+    def fluid_walls(self, faces: Faces, grid: Grid, window: Int[Array, "d"]) -> tuple[WallImage, ...]:
+        """The maps of walls across an axis that what flows never leaves (see `wall_image`), if it `sees_fluids` and
+        there is some. Default: none."""
+        del faces, grid, window
+        return ()
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         """The rigid surfaces that push the faces of particles in the step from t to t + dt, if it `pushes`. Default:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import reduce
+from itertools import chain
 from typing import ClassVar
 
 import equinox as eqx
@@ -12,11 +13,12 @@ from mpmjax._types import Array, Bool, Corner, Float, Int, NodeVector, ParticleV
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._plane_contact import SHUT, HeldPlanes, fluid_walls, plane_contact
+from mpmjax.boundary._plane_contact import SHUT, plane_contact
 from mpmjax.boundary._surface_contact import SIGNS, Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import Motion
+from mpmjax.potential import WallImage, wall_image
 
 
 class AbstractBox(AbstractBoundary):
@@ -71,6 +73,17 @@ class AbstractBox(AbstractBoundary):
         first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
         return (first_free - reach - ON_THE_WALL) * spacing
 
+    def walls_across(
+        self, axis: int, faces: Faces, grid: Grid, window: Int[Array, "d"], *, sticks: bool = False
+    ) -> tuple[WallImage, ...]:
+        """The maps of the two walls across an axis for what flows (see `wall_image`)."""
+        order, filled = len(faces.stencil.basis.knots) - 1, (faces.stencil, faces.flowing_volume)
+        places = zip((self.lower, self.upper), SIGNS, strict=True)
+        return tuple(
+            wall_image(axis, jnp.asarray(corner)[axis], inward, grid, window, order, filled, sticks=sticks)
+            for corner, inward in places
+        )
+
     def walls(self) -> tuple[Wall, ...]:
         return tuple(
             Wall(axis, float(at), inward)
@@ -109,22 +122,17 @@ class AbstractHoldingBox(AbstractBox):
             fixed = jnp.broadcast_to(fixed.any(axis=1, keepdims=True), nodes.shape)
         return held_by_wall(fixed, self.motion, nodes, t, dt)
 
-    def contacts(
-        self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
-    ) -> tuple[AbstractContact, ...]:
-        """Two walls an axis that hold the columns of nodes around what flows."""
-        if faces is None or self.motion is not None or not faces.flowing.any():
+    def fluid_walls(self, faces: Faces, grid: Grid, window: Int[Array, "d"]) -> tuple[WallImage, ...]:
+        """Two an axis, in the columns of nodes around what flows."""
+        if self.motion is not None:
             return ()
-        around, contacts = None, []
-        if not faces.flowing.all():
-            flowing = jnp.broadcast_to(faces.flowing, (2, len(faces.x))).astype(faces.x.dtype)
-            around = scatter(faces.stencil, flowing, None, grid.size)
-        for axis in range(self.dim):
-            places = (jnp.asarray(self.lower)[axis], 1), (jnp.asarray(self.upper)[axis], -1)
-            walls = fluid_walls(axis, places, faces, grid, window, sticks=self.sticks)
-            every = jnp.ones((grid.size, 2)) if around is None else around
-            contacts.append(plane_contact(walls, SIGNS, None, every, HeldPlanes))
-        return tuple(contacts)
+        across = (self.walls_across(axis, faces, grid, window, sticks=self.sticks) for axis in range(self.dim))
+        walls = tuple(chain.from_iterable(across))
+        if faces.flowing.all():
+            return walls
+        flowing = jnp.asarray(faces.flowing, faces.x.dtype)
+        around = scatter(faces.stencil, flowing[None], None, grid.size)[:, 0]
+        return tuple(replace(wall, held=wall.columns_around(around)) for wall in walls)
 
 
 class StickyBox(AbstractHoldingBox):
@@ -231,8 +239,7 @@ class SeparatingBox(AbstractBox):
         for axis, surface in enumerate(surfaces):
             if not (faces.explicit and flowing.all()):
                 contacts.append(replace(surface, beside=~shut[axis]))
-            places = (jnp.asarray(self.lower)[axis], 1), (jnp.asarray(self.upper)[axis], -1)
-            walls = fluid_walls(axis, places, faces, grid, window)
+            walls = self.walls_across(axis, faces, grid, window)
             contacts.append(plane_contact(walls, SIGNS, self.friction, around[:, 2 * axis : 2 * axis + 2]))
         return tuple(contacts)
 

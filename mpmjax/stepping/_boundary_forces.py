@@ -100,12 +100,9 @@ def impulse_on_boundaries(
     for part in held.along_normals(residual):
         parts.append(OwnedImpulse(part.impulse, jnp.where(part.owner < 0, -1, numbers[part.owner])))
         residual = residual - part.impulse
-    columns = [
-        (number, image)
-        for number, contact, active in contacts
-        if number is not None
-        for image in contact.images(active)
-    ]
+    columns = [(number, wall) for number, walls in enumerate(nodes.walls) for wall in walls]
+    for number, contact, active in contacts:
+        columns += [] if number is None else [(number, image) for image in contact.images(active)]
     of_planes, residual = taken_by_mirrors(residual, columns)
     parts += [*of_planes, OwnedImpulse(residual, owners)]
     taken = owners >= 0
