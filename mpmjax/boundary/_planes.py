@@ -90,7 +90,25 @@ class AbstractPlane(AbstractBoundary):
         return (Wall(self.axis, float(self.position), self.inward, mirrored=True),)
 
 
-class SymmetryPlane(AbstractPlane):
+class AbstractHoldingPlane(AbstractPlane):
+    """A plane that is never left, at rest or in motion."""
+
+    motion: eqx.AbstractVar[AbstractMotion | None]
+    """How it moves; None for not at all."""
+
+    @property
+    def dim(self) -> int | None:
+        return None if self.motion is None else self.motion.dim
+
+    def mirror(self) -> MirrorPlace:
+        return MirrorPlace(self.axis, self.position, self.motion)
+
+    def walls(self) -> tuple[Wall, ...]:
+        """Where it starts."""
+        return (Wall(self.axis, float(self.position), self.inward, mirrored=self.motion is None),)
+
+
+class SymmetryPlane(AbstractHoldingPlane):
     """A plane of mirror symmetry: nodes beyond it are mirror images. It is also a frictionless wall that
     material cannot leave.
 
@@ -120,14 +138,6 @@ class SymmetryPlane(AbstractPlane):
     def __check_init__(self):
         require_fields(self)
 
-    @property
-    def dim(self) -> int | None:
-        return None if self.motion is None else self.motion.dim
-
-    def walls(self) -> tuple[Wall, ...]:
-        """Where it starts."""
-        return (Wall(self.axis, float(self.position), self.inward, mirrored=self.motion is None),)
-
     def displacement(self, t: Scalar) -> Scalar:
         return 0.0 if self.motion is None else self.motion.at(t)[self.axis]
 
@@ -137,9 +147,6 @@ class SymmetryPlane(AbstractPlane):
         on = jnp.abs(nodes[:, self.axis] - at) <= ON_THE_WALL * spacing
         fixed = jnp.zeros(nodes.shape, dtype=bool).at[:, self.axis].set(on)
         return held_by_wall(fixed, self.motion, nodes, t, dt)
-
-    def mirror(self) -> MirrorPlace:
-        return MirrorPlace(self.axis, self.position, self.motion)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """A window cannot follow the material and a plane."""
@@ -155,7 +162,7 @@ class SymmetryPlane(AbstractPlane):
         return (replace(mirror_image(self.axis, self.position, self.keep, grid, window), velocity=velocity),)
 
 
-class ClampPlane(AbstractPlane):
+class ClampPlane(AbstractHoldingPlane):
     """A plane to which the body's face is fixed: a grip that holds at its surface.
 
     Nodes beyond it have the opposite of their image's velocity, so that the spline vanishes on the plane: second order
@@ -183,13 +190,6 @@ class ClampPlane(AbstractPlane):
     def __check_init__(self):
         require_fields(self)
 
-    @property
-    def dim(self) -> int | None:
-        return None if self.motion is None else self.motion.dim
-
-    def mirror(self) -> MirrorPlace:
-        return MirrorPlace(self.axis, self.position, self.motion)
-
     def check(self, grid: Grid, *, total: bool) -> None:
         """A motion needs the total description."""
         AbstractPlane.check(self, grid, total=total)
@@ -197,10 +197,6 @@ class ClampPlane(AbstractPlane):
             self.motion is None or total,
             "A ClampPlane moves in the total description only, whose nodes stay with the body: take that, or a Grip.",
         )
-
-    def walls(self) -> tuple[Wall, ...]:
-        """Where it starts."""
-        return (Wall(self.axis, float(self.position), self.inward, mirrored=self.motion is None),)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = V on the plane's own nodes."""
