@@ -6,12 +6,18 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, AbstractNodes, ConstrainedNodes, N, friction_change
-from mpmjax.potential import Image, WallImage
+from mpmjax.boundary._surface_contact import Faces
+from mpmjax.discretisation import Grid
+from mpmjax.potential import Image, WallImage, wall_image
 
 SHUT = 1e-2
 """The gap up to which a plane holds what is before it, in spacings."""
+
+
+FlatWall = tuple[int, Scalar, Array | int]
+"""The axis across which a wall lies, its coordinate [m], infinite for none, and its inward normal's component, ±1."""
 
 
 class PlaneContact(AbstractContact):
@@ -125,6 +131,14 @@ def with_tied_columns(nodes: N) -> N:
         return replace(wall, held=columns > 0)
 
     return replace(nodes, walls=tuple(tuple(map(tied, walls)) for walls in nodes.walls))
+
+
+def wall_images(
+    planes: tuple[FlatWall, ...], faces: Faces, grid: Grid, window: Int[Array, "d"], *, sticks: bool = False
+) -> tuple[WallImage, ...]:
+    """The maps of planes for what flows (see `wall_image`)."""
+    order, filled = len(faces.stencil.basis.knots) - 1, (faces.stencil, faces.flowing_volume)
+    return tuple(wall_image(*plane, grid, window, order, filled, sticks=sticks) for plane in planes)
 
 
 def column_weight(wall: WallImage, mass: NodeScalar) -> Array:

@@ -13,12 +13,11 @@ from mpmjax._types import Array, Bool, Corner, Float, Int, NodeVector, ParticleV
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._plane_contact import SHUT, plane_contact
+from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
 from mpmjax.boundary._surface_contact import SIGNS, Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import Motion
-from mpmjax.potential import WallImage, wall_image
 
 
 class AbstractBox(AbstractBoundary):
@@ -73,16 +72,10 @@ class AbstractBox(AbstractBoundary):
         first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
         return (first_free - reach - ON_THE_WALL) * spacing
 
-    def walls_across(
-        self, axis: int, faces: Faces, grid: Grid, window: Int[Array, "d"], *, sticks: bool = False
-    ) -> tuple[WallImage, ...]:
-        """The maps of the two walls across an axis for what flows (see `wall_image`)."""
-        order, filled = len(faces.stencil.basis.knots) - 1, (faces.stencil, faces.flowing_volume)
-        places = zip((self.lower, self.upper), SIGNS, strict=True)
-        return tuple(
-            wall_image(axis, jnp.asarray(corner)[axis], inward, grid, window, order, filled, sticks=sticks)
-            for corner, inward in places
-        )
+    def across(self, axis: int) -> tuple[FlatWall, FlatWall]:
+        """The two walls across an axis."""
+        lower, upper = jnp.asarray(self.lower)[axis], jnp.asarray(self.upper)[axis]
+        return (axis, lower, 1), (axis, upper, -1)
 
     def walls(self) -> tuple[Wall, ...]:
         return tuple(
@@ -99,9 +92,6 @@ class AbstractHoldingBox(AbstractBox):
 
     motion: eqx.AbstractVar[Motion | None]
     """How the walls move together; None for not at all."""
-    sticks: ClassVar[bool]
-    """Whether they hold the whole velocity."""
-    sees_fluids: ClassVar[bool] = True
 
     def __check_init__(self):
         require_fields(self)
@@ -122,17 +112,9 @@ class AbstractHoldingBox(AbstractBox):
             fixed = jnp.broadcast_to(fixed.any(axis=1, keepdims=True), nodes.shape)
         return held_by_wall(fixed, self.motion, nodes, t, dt)
 
-    def fluid_walls(self, faces: Faces, grid: Grid, window: Int[Array, "d"]) -> tuple[WallImage, ...]:
-        """Two an axis, in the columns of nodes around what flows."""
-        if self.motion is not None:
-            return ()
-        across = (self.walls_across(axis, faces, grid, window, sticks=self.sticks) for axis in range(self.dim))
-        walls = tuple(chain.from_iterable(across))
-        if faces.flowing.all():
-            return walls
-        flowing = jnp.asarray(faces.flowing, faces.x.dtype)
-        around = scatter(faces.stencil, flowing[None], None, grid.size)[:, 0]
-        return tuple(replace(wall, held=wall.columns_around(around)) for wall in walls)
+    def planes(self) -> tuple[FlatWall, ...]:
+        """Two an axis, while they rest."""
+        return () if self.motion is not None else tuple(chain.from_iterable(map(self.across, range(self.dim))))
 
 
 class StickyBox(AbstractHoldingBox):
@@ -173,7 +155,6 @@ class SlipBox(AbstractHoldingBox):
     lower: Corner
     upper: Corner
     motion: Motion | None = None
-    sticks: ClassVar[bool] = False
 
 
 class SeparatingBox(AbstractBox):
@@ -239,7 +220,7 @@ class SeparatingBox(AbstractBox):
         for axis, surface in enumerate(surfaces):
             if not (faces.explicit and flowing.all()):
                 contacts.append(replace(surface, beside=~shut[axis]))
-            walls = self.walls_across(axis, faces, grid, window)
+            walls = wall_images(self.across(axis), faces, grid, window)
             contacts.append(plane_contact(walls, SIGNS, self.friction, around[:, 2 * axis : 2 * axis + 2]))
         return tuple(contacts)
 

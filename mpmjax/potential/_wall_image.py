@@ -142,10 +142,11 @@ def wall_image(
     count = min(order + 3, length)  # from b to the nodes of what is a spacing behind the wall
     place = jnp.asarray(position) / grid.spacing  # then from the window's first node, of a wall that is none far off
     place = jnp.clip(place - window[axis].astype(place.dtype), -length, 2 * length)
-    base = inward * (jnp.floor(inward * place + max(order - 1, 1) / 2 - near).astype(jnp.int32) + 1)
+    sign = jnp.asarray(inward, place.dtype)
+    base = inward * (jnp.floor(sign * place + max(order - 1, 1) / 2 - near).astype(jnp.int32) + 1)
     start = jnp.clip(jnp.where(inward > 0, base - count + 1, base), 0, length - count)
     j = start + jnp.arange(count, dtype=jnp.int32)
-    before, of_base = (inward * (row.astype(place.dtype) - place) for row in (j, base))
+    before, of_base = (sign * (row.astype(place.dtype) - place) for row in (j, base))
     follows, stays = inward * (j - base) < 0, before > -0.25 - near
     if filled is not None:
         along, volume = filled[0].along(axis), filled[1]
@@ -155,7 +156,7 @@ def wall_image(
             for n, slope in enumerate(along.weight_derivatives[0]):
                 node = along.first[0] + n
                 part = jnp.where(inward * (node - base) <= 0, slope, 0)
-                force, moment = force + part, moment + part * inward * (node.astype(place.dtype) - place)
+                force, moment = force + part, moment + part * sign * (node.astype(place.dtype) - place)
             total, first = jnp.stack([force, moment]) @ volume  # a product, of which XLA makes vectors
             return jnp.clip(jnp.where(total == 0, 0, first / jnp.where(total == 0, 1, total)), -0.02, 0.02)
 

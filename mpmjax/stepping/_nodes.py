@@ -243,7 +243,7 @@ def with_boundaries(
         moved = places_of(particles, potential.stencil, grid.size)
         place = jnp.where(slid[:, None] & nodes.occupied, moved, conditions.colliders.position)
         conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
-    faces, walls, flows = None, (), any(law.flows for law in scene.laws) and any(b.sees_fluids for b in scene.boundary)
+    faces, walls, flows = None, (), any(law.flows for law in scene.laws) and any(b.planes() for b in scene.boundary)
     if flows or any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
         faces = faces_of(scene, particles, potential, t, dt, force_at)
         walls = tuple(boundary.fluid_walls(faces, grid, window) for boundary in scene.boundary) if flows else ()
