@@ -95,7 +95,7 @@ def test_what_is_reported_has_the_error_that_follows(both):
     assert both["mu"].value == pytest.approx(E / (2 * (1 + nu)))
     share = nu / 0.49
     slope = both["mu"].value * np.array([1, -0.49 * share * (1 - share) / (1 + nu)])
-    assert both["mu"].error == pytest.approx(np.sqrt(slope @ both.covariance @ slope), rel=1e-6)
+    assert both["mu"].error == pytest.approx(np.sqrt(slope @ both.uncertainty.covariance @ slope), rel=1e-6)
 
 
 def test_the_table_and_the_fitted_scene(both):

@@ -4,7 +4,7 @@ from typing import Any
 
 from mpmjax.cli._fit_file import OPTIMISERS, fit_parameter, fit_settings
 from mpmjax.cli._measurements import KINDS, keys_of
-from mpmjax.cli._scene_file import RunSettings
+from mpmjax.cli._scene_file import RunSettings, particles_in
 from mpmjax.io import class_schemas, save, table_schema
 from mpmjax.state import Scene, fill
 
@@ -31,7 +31,7 @@ def scene_schema() -> dict[str, Any]:
     }
     schema = table_schema(Scene)
     schema["properties"] |= {
-        "particles": {"anyOf": [particles, tables(particles)]},
+        "particles": {"anyOf": [particles, tables(particles), table_schema(particles_in)]},
         "run": run,
         "output": table_schema(save, without=("path", "run")),
         "fit": fit,

@@ -135,14 +135,22 @@ class AbstractParameter(eqx.Module):
 
     It is searched in a coordinate z, of the value's shape, that takes every real number and is zero at the first guess:
     no bound is ever crossed, and a step of one is a large but not an absurd change.
+
+    Args:
+        where: the leaf, `lambda e: e.scene.material.youngs_modulus`, or a tuple of leaves that share the value.
+        update: in its place, the experiment with the value put in, `lambda e, value: ...`.
+        start: first guess. Default: the value of the first experiment.
+        prior: what is known beforehand.
+        unit: the unit that tables show.
+        only: numbers of the experiments that it belongs to, from 0. Default: all.
     """
 
-    where: eqx.AbstractVar[Callable[[Experiment], Any] | None]  # the leaf, or a tuple that share the value
-    update: eqx.AbstractVar[Callable[[Experiment, Value], Experiment] | None]  # in its place: puts the value in
-    start: eqx.AbstractVar[Start | None]  # the first guess; None for the value of the first experiment
-    prior: eqx.AbstractVar[AbstractPrior | None]  # prior knowledge of it
-    unit: eqx.AbstractVar[str]  # the unit that tables show
-    only: eqx.AbstractVar[tuple[int, ...] | None]  # numbers, from 0, of the experiments it belongs to; None for all
+    where: Callable[[Experiment], Any] | None = None
+    update: Callable[[Experiment, Value], Experiment] | None = eqx.field(default=None, kw_only=True)
+    start: Start | None = eqx.field(default=None, kw_only=True)
+    prior: AbstractPrior | None = eqx.field(default=None, kw_only=True)
+    unit: str = eqx.field(static=True, default="", kw_only=True)
+    only: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain, kw_only=True)
 
     def __check_init__(self):
         require_fields(self)
@@ -224,19 +232,8 @@ def leaves_of(where: Callable[[Experiment], Any] | None, experiment: Experiment)
     return leaves if isinstance(leaves, tuple) else (leaves,)
 
 
-class _PlainParameter(AbstractParameter):
-    """A parameter whose values are put in as they are."""
-
-    where: Callable[[Experiment], Any] | None = None
-    update: Callable[[Experiment, Value], Experiment] | None = eqx.field(default=None, kw_only=True)
-    start: Start | None = eqx.field(default=None, kw_only=True)
-    prior: AbstractPrior | None = eqx.field(default=None, kw_only=True)
-    unit: str = eqx.field(static=True, default="", kw_only=True)
-    only: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain, kw_only=True)
-
-
-class Unbounded(_PlainParameter):
-    """A parameter that may have any value, such as a velocity or an angle. For all but the scale see `Positive`.
+class Unbounded(AbstractParameter):
+    """A parameter that may have any value, such as a velocity or an angle; all but the scale as `AbstractParameter`.
 
     Args:
         scale: a change that is large but not absurd. Default: the size of the first guess, or one if that is zero.
@@ -263,17 +260,8 @@ class Unbounded(_PlainParameter):
         return jnp.where(size == 0, 1, size) if self.scale is None else self.scale
 
 
-class Positive(_PlainParameter):
-    """A positive parameter, such as a modulus, a viscosity or a density: start·e^z.
-
-    Args:
-        where: the leaf, `lambda e: e.scene.material.youngs_modulus`, or a tuple of leaves that share the value.
-        update: in its place, the experiment with the value put in, `lambda e, value: ...`.
-        start: first guess. Default: the value of the first experiment.
-        prior: what is known beforehand.
-        unit: the unit that tables show.
-        only: numbers of the experiments that it belongs to. Default: all.
-    """
+class Positive(AbstractParameter):
+    """A positive parameter, such as a modulus, a viscosity or a density: start·e^z; see `AbstractParameter`."""
 
     @property
     def logarithmic(self) -> bool:
@@ -294,12 +282,9 @@ class Positive(_PlainParameter):
         return jnp.ones_like(z), jnp.full_like(z, jnp.inf)
 
 
-class Bounded(_PlainParameter):
-    """A parameter between two bounds, such as Poisson's ratio: lower + (upper − lower)/(1 + e^{−(z0 + z)}).
-
-    Args:
-        lower, upper: the bounds; all else see `Positive`.
-    """
+class Bounded(AbstractParameter):
+    """A parameter between two bounds, such as Poisson's ratio: lower + (upper − lower)/(1 + e^{−(z0 + z)}); all but
+    these as `AbstractParameter`."""
 
     lower: float | int = eqx.field(static=True, default=0.0, converter=as_plain)  # the lower bound
     upper: float | int = eqx.field(static=True, default=1.0, converter=as_plain)  # the upper bound
@@ -347,14 +332,11 @@ class Field(AbstractParameter):
     of: AbstractParameter
     lattice: Grid
     kernel: BSpline
-    start: Start | None
 
     # All else is of the parameter that it spreads.
-    where, update, prior, unit, only, domain = (  # pyright: ignore
-        property(attrgetter(f"of.{name}")) for name in ("where", "update", "prior", "unit", "only", "domain")
-    )
-    value, coordinate, free, check, room, logarithmic = (  # pyright: ignore
-        property(attrgetter(f"of.{name}")) for name in ("value", "coordinate", "free", "check", "room", "logarithmic")
+    value, coordinate, free, check, room, logarithmic, domain = (  # pyright: ignore
+        property(attrgetter(f"of.{name}"))
+        for name in ("value", "coordinate", "free", "check", "room", "logarithmic", "domain")
     )
 
     @checked
@@ -363,6 +345,7 @@ class Field(AbstractParameter):
     ):
         self.of, self.lattice, self.kernel = of, lattice, kernel
         self.start = of.start if start is None else start
+        self.where, self.update, self.prior, self.unit, self.only = of.where, of.update, of.prior, of.unit, of.only
 
     def __check_init__(self):
         require(not isinstance(self.of, Field), "A Field is of a plain parameter, not of another Field.")

@@ -151,9 +151,9 @@ def _numbers(
     of_profile = ("label", "interval", "threshold", "degrees_of_freedom", "level", "warnings")
     return {
         "estimates": [e._asdict() for e in result.all],
-        "fisher_spectrum": result.spectrum,
-        "covariance_of_coordinates": result.covariance,
-        "fisher_directions": result.directions,
+        "fisher_spectrum": result.uncertainty.spectrum,
+        "covariance_of_coordinates": result.uncertainty.covariance,
+        "fisher_directions": result.uncertainty.directions,
         **{name: getattr(result, name) for name in plain},
         "noise": [n._asdict() for n in result.noise],
         "predictions": [
