@@ -195,8 +195,8 @@ def _probe(
 def _stirs_fluids(boundary: AbstractBoundary) -> bool:
     """Whether it is a collider at rest across an axis at which fluids find no rest."""
     shape, rests = getattr(boundary, "shape", None), getattr(boundary, "motion", None) is None
-    across = isinstance(shape, HalfSpace) and np.count_nonzero(np.asarray(jnp.asarray(shape.normal))) == 1
-    return boundary.pushes and rests and across
+    across = isinstance(shape, HalfSpace) and np.count_nonzero(jnp.asarray(shape.normal)) == 1
+    return bool(boundary.pushes and rests and across)
 
 
 def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Any) -> Any:
