@@ -359,11 +359,11 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     """The nodes with an active set held; no contact may hold anything of them yet."""
     pairs = list(zip(nodes.contacts, active, strict=True))
-    walls = sum((*nodes.walls, *(contact.images(mask) for contact, mask in pairs)), ())
+    # those that hold every column come last: they fill in what lies behind them in columns that contacts release
+    walls = sum((*(contact.images(mask) for contact, mask in pairs), *nodes.walls), ())
     fixed = nodes.conditions.fixed
     images, mass = with_one_mass(walls, nodes.mass, fixed.shape[1]) if walls else (Mirror(()), nodes.mass)
-    for contact, mask in pairs:
-        fixed = fixed | contact.fixed(mask, fixed.shape)
+    fixed = reduce(jnp.logical_or, (contact.fixed(mask, fixed.shape) for contact, mask in pairs), fixed)
     springs = tuple(term for contact, mask in pairs if (term := contact.springs(mask)) is not None)
     return ConstrainedNodes(nodes, active, images, nodes.constrained(images, mass, fixed, springs))
 

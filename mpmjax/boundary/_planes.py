@@ -93,7 +93,7 @@ class AbstractPlane(AbstractBoundary):
 class AbstractHoldingPlane(AbstractPlane):
     """A plane that is never left, at rest or in motion."""
 
-    motion: eqx.AbstractVar[AbstractMotion | None]
+    motion: eqx.AbstractVar[Any]
     """How it moves; None for not at all."""
 
     @property

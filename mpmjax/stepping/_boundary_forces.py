@@ -34,7 +34,9 @@ def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator,
     holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
     parts = list(held.along_normals(holding))
     of_walls, holding = taken_by_mirrors(held.without_collider_impulses(holding), _walls_of(nodes))
-    parts += [replace(part, owner=numbers.index(part.owner)) for part in of_walls if part.owner in numbers]
+    for part in of_walls:
+        if isinstance(part.owner, int) and part.owner in numbers:
+            parts.append(replace(part, owner=numbers.index(part.owner)))
     parts.append(OwnedImpulse(holding, colliders.holder))
     mass, tied = (nodes if nodes.loose is None else nodes.loose).mass[:, None], Mirror(nodes.tied)
     for number, contact, active, change in zip(
@@ -105,9 +107,8 @@ def impulse_on_boundaries(
     for part in held.along_normals(residual):
         parts.append(OwnedImpulse(part.impulse, jnp.where(part.owner < 0, -1, numbers[part.owner])))
         residual = residual - part.impulse
-    columns = _walls_of(nodes)
-    for number, contact, active in contacts:
-        columns += [] if number is None else [(number, image) for image in contact.images(active)]
+    brought = [(number, contact.images(active)) for number, contact, active in contacts if number is not None]
+    columns = [*((number, image) for number, images in brought for image in images), *_walls_of(nodes)]
     of_planes, residual = taken_by_mirrors(residual, columns)
     parts += [*of_planes, OwnedImpulse(residual, owners)]
     taken = owners >= 0
