@@ -45,6 +45,7 @@ from mpmjax.boundary._impulses import (
     received_impulses as received_impulses,
     taken_by_mirrors as taken_by_mirrors,
 )
+from mpmjax.boundary._plane_contact import with_tied_columns as with_tied_columns
 from mpmjax.boundary._planes import (
     ClampPlane as ClampPlane,
     ContactPlane as ContactPlane,

@@ -18,9 +18,10 @@ import numpy as np
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._conditions import Conditions, no_conditions
 from mpmjax.boundary._contact import AbstractContact
+from mpmjax.boundary._plane_contact import FlatWall, wall_images
 from mpmjax.boundary._surface_contact import Faces, Surface, surface_contact
-from mpmjax.discretisation import Grid
-from mpmjax.potential import Image, Mirror, MirrorPlace, Tie
+from mpmjax.discretisation import Grid, scatter
+from mpmjax.potential import Image, Mirror, MirrorPlace, Tie, WallImage
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
@@ -52,8 +53,8 @@ class AbstractBoundary(eqx.Module):
     """Whether it has `surfaces` that push material away."""
     sees_faces: ClassVar[bool] = False
     """Whether its `contacts` need the faces of particles though it does not push."""
-    sees_fluids: ClassVar[bool] = False
-    """Whether its `contacts` need the faces of particles where one flows."""
+    sticks: ClassVar[bool] = False
+    """Whether it holds the whole velocity, and not the normal one alone."""
     meets_constraints: ClassVar[bool] = True
     """Whether it may stand in a scene with constrained bodies, such as rigid ones. What it prescribes of a node it
     prescribes of the body."""
@@ -107,6 +108,19 @@ class AbstractBoundary(eqx.Module):
         if faces is None or not self.pushes:
             return ()
         return tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
+
+    def planes(self) -> tuple[FlatWall, ...]:
+        """The planes across an axis that what flows never leaves. Default: none."""
+        return ()
+
+    def fluid_walls(self, faces: Faces, grid: Grid, window: Int[Array, "d"]) -> tuple[WallImage, ...]:
+        """The maps of these in the columns of nodes around what flows (see `wall_image`)."""
+        walls = wall_images(self.planes(), faces, grid, window, sticks=self.sticks)
+        if not walls or faces.flowing.all():
+            return walls
+        flowing = jnp.asarray(faces.flowing, faces.x.dtype)
+        around = scatter(faces.stencil, flowing[None], None, grid.size)[:, 0]
+        return tuple(replace(wall, held=wall.columns_around(around)) for wall in walls)
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         """The rigid surfaces that push the faces of particles in the step from t to t + dt, if it `pushes`. Default:

@@ -18,10 +18,11 @@ import numpy as np
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import ColliderConditions, Conditions, Slide, no_conditions
+from mpmjax.boundary._plane_contact import FlatWall
 from mpmjax.boundary._surface_contact import Surface, refuse_contact
 from mpmjax.checks import canonical, require, require_between, require_fields
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import AbstractMotion, AbstractRegion, length, still
+from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, length, still
 
 _LOOKS = 4  # places of a particle's way in which a collider is looked for
 
@@ -107,8 +108,26 @@ class AbstractCollider(AbstractBoundary):
         return conditions, place, motion.velocity_of(place, t, dt)
 
 
-class StickyCollider(AbstractCollider):
-    """A body to which the material sticks: nodes in it have its velocity, exactly, also after a solve.
+class AbstractHoldingCollider(AbstractCollider):
+    """A body from which material cannot part. It holds the nodes in it; what flows a half-space across an axis that
+    rests holds by columns of nodes as a box does, so that it stays at rest: its motion has no derivative by the
+    half-space's place and normal."""
+
+    meets_constraints: ClassVar[bool] = False
+
+    def planes(self) -> tuple[FlatWall, ...]:
+        """One an axis, infinitely far where the normal is not along it."""
+        if self.motion is not None or not isinstance(self.shape, HalfSpace):
+            return ()
+        point, normal = jnp.asarray(self.shape.point), jnp.asarray(self.shape.normal)
+        inward, along = jnp.where(normal < 0, -1, 1), (normal != 0) & ((normal != 0).sum() == 1)
+        places = jnp.where(along, point, jnp.where(normal < 0, jnp.inf, -jnp.inf))
+        return tuple((axis, places[axis], inward[axis]) for axis in range(self.dim))
+
+
+class StickyCollider(AbstractHoldingCollider):
+    """A body to which the material sticks: nodes in it have its velocity, exactly, also after a solve. Fluids stay at
+    rest at a half-space across an axis that rests.
 
     In the total description it holds the reference nodes that lie in it before its motion: a grip that can turn.
 
@@ -119,7 +138,7 @@ class StickyCollider(AbstractCollider):
 
     shape: AbstractRegion
     motion: AbstractMotion | None = None
-    meets_constraints: ClassVar[bool] = False
+    sticks: ClassVar[bool] = True
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = v_c."""
@@ -129,9 +148,9 @@ class StickyCollider(AbstractCollider):
         return Conditions(fixed, jnp.where(fixed, velocity, 0), touched, moves=self.motion is not None)
 
 
-class SlipCollider(AbstractCollider):
+class SlipCollider(AbstractHoldingCollider):
     """A body along which the material slides freely and from which it cannot part: nodes in it have its velocity along
-    the normal, exactly, also after a solve.
+    the normal, exactly, also after a solve. Fluids stay at rest at a half-space across an axis that rests.
 
     In the total description only a half-space without rotation: elsewhere the normal of a reference node changes as it
     slides.
@@ -143,7 +162,6 @@ class SlipCollider(AbstractCollider):
 
     shape: AbstractRegion
     motion: AbstractMotion | None = None
-    meets_constraints: ClassVar[bool] = False
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """In the total description its normal must be the same everywhere and always."""

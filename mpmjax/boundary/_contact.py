@@ -59,6 +59,8 @@ class AbstractNodes(eqx.Module):
     """The potential Φ of the nodes' displacement, with the mirrors of symmetry planes and of columns that are held."""
     contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]
     """The boundaries that may be left."""
+    walls: eqx.AbstractVar[tuple[tuple[WallImage, ...], ...]]
+    """The walls of each boundary that hold what flows at all times; empty without any."""
     brought_by: eqx.AbstractVar[tuple[int | None, ...]]
     """The number of the boundary that brings each contact; None for that of two bodies."""
     loose: eqx.AbstractVar[Any]
@@ -253,7 +255,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     active: ActiveSet
     """The active set."""
     images: Mirror
-    """The mirrors in the columns that are held."""
+    """The mirrors in the columns that are held, by contacts or at all times."""
     nodes: N
     """The nodes with the active set held."""
     displacement: NodeVector | None = None
@@ -273,8 +275,9 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     def beyond_boundaries(self) -> tuple[Mask, tuple[NodeVector, ...]]:
         """The components of velocity on which no boundary acts, shape (n, d), and the normals that colliders hold."""
         free = self.unconstrained.free
-        for contact, active in zip(self.unconstrained.contacts, self.active, strict=True):
-            free = free & ~contact.reached(active, free.shape)
+        reached = [image.reached(free.shape) for image in self.images.images if isinstance(image, WallImage)]
+        reached += [c.reached(a, free.shape) for c, a in zip(self.unconstrained.contacts, self.active, strict=True)]
+        free = reduce(lambda free, held: free & ~held, reached, free)
         return free, tuple(jnp.where(free, normal, 0) for normal in self.nodes.projection.normals)
 
     def along_normals(self, residual: NodeVector) -> tuple[OwnedImpulse, ...]:
@@ -356,11 +359,11 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     """The nodes with an active set held; no contact may hold anything of them yet."""
     pairs = list(zip(nodes.contacts, active, strict=True))
-    walls = tuple(image for contact, mask in pairs for image in contact.images(mask))
+    # those that hold every column come last: they fill in what lies behind them in columns that contacts release
+    walls = sum((*(contact.images(mask) for contact, mask in pairs), *nodes.walls), ())
     fixed = nodes.conditions.fixed
     images, mass = with_one_mass(walls, nodes.mass, fixed.shape[1]) if walls else (Mirror(()), nodes.mass)
-    for contact, mask in pairs:
-        fixed = fixed | contact.fixed(mask, fixed.shape)
+    fixed = reduce(jnp.logical_or, (contact.fixed(mask, fixed.shape) for contact, mask in pairs), fixed)
     springs = tuple(term for contact, mask in pairs if (term := contact.springs(mask)) is not None)
     return ConstrainedNodes(nodes, active, images, nodes.constrained(images, mass, fixed, springs))
 

@@ -1,4 +1,5 @@
-"""Walls that hold columns of nodes across an axis: those of contact planes, and of boxes around what flows."""
+"""Walls that hold columns of nodes across an axis while these press: those of contact planes, and of boxes around what
+flows."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,13 +7,17 @@ from dataclasses import replace
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.boundary._contact import AbstractContact, AbstractNodes, ConstrainedNodes, friction_change
+from mpmjax.boundary._contact import AbstractContact, AbstractNodes, ConstrainedNodes, N, friction_change
 from mpmjax.boundary._surface_contact import Faces
 from mpmjax.discretisation import Grid
 from mpmjax.potential import Image, WallImage, wall_image
 
 SHUT = 1e-2
 """The gap up to which a plane holds what is before it, in spacings."""
+
+
+FlatWall = tuple[int, Scalar, Array | int]
+"""The axis across which a wall lies, its coordinate [m], infinite for none, and its inward normal's component, ±1."""
 
 
 class PlaneContact(AbstractContact):
@@ -46,8 +51,7 @@ class PlaneContact(AbstractContact):
 
     def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
         """In explicit steps, where nothing across another axis and no other boundary moves the nodes of a column."""
-        planes = (contact for contact in nodes.contacts if isinstance(contact, PlaneContact))
-        alone = all(plane.axis == self.axis for plane in planes) and not nodes.potential.mirror.images
+        alone = all(wall.axis == self.axis for wall in walls_of(nodes)) and not nodes.potential.mirror.images
         return explicit and alone and not nodes.conditions.holds
 
     def images(self, active: Array) -> tuple[WallImage, ...]:
@@ -57,10 +61,10 @@ class PlaneContact(AbstractContact):
         """The momentum with which each column leaves its wall [kg m/s]: its weights times what its velocity lacks of
         the map's."""
         mass, along = held.unconstrained.mass, v[:, self.axis]
-        each = [
-            inward * wall.column(column_weight(wall, mass) * (wall.rows(along) - wall.share * wall.row(along)))
-            for inward, wall in zip(self.inward, self.walls, strict=True)
-        ]
+        each = []
+        for inward, wall in zip(self.inward, self.walls, strict=True):
+            rows = wall.rows(along)
+            each.append(inward * wall.column(column_weight(wall, mass) * (rows - wall.share * wall.row(rows))))
         return self._tied(held, jnp.where(self.shut, jnp.concatenate(each, axis=-1), 0))
 
     def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Array:
@@ -99,55 +103,42 @@ class PlaneContact(AbstractContact):
             across = wall.with_rows(across, wall.rows(across) | held)
         return across[:, None] & (jnp.arange(shape[1]) == self.axis)
 
-    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """All components of the columns held."""
-        wall = self.walls[0]
-        columns = jnp.broadcast_to(active.any(axis=-1), (wall.layers, *wall.shape))
-        return jnp.broadcast_to(columns.reshape(-1, 1), shape)
-
     def _tied(self, held: ConstrainedNodes, columns: Array) -> Array:
         """A quantity of the columns, summed over columns that are each other's image in other planes."""
         nodes = held.unconstrained
-        for image in (*_walls_of(nodes), *nodes.potential.mirror.images):
+        for image in (*walls_of(nodes), *nodes.potential.mirror.images):
             if isinstance(image, Image | WallImage) and image.axis != self.axis:
                 columns = image.united(columns)
         return columns
 
 
-def _walls_of(nodes: AbstractNodes) -> list[WallImage]:
-    return [wall for contact in nodes.contacts if isinstance(contact, PlaneContact) for wall in contact.walls]
+def walls_of(nodes: AbstractNodes) -> list[WallImage]:
+    """The walls across axes, of contacts and those that are never left."""
+    planes = (contact for contact in nodes.contacts if isinstance(contact, PlaneContact))
+    return [wall for walls in (*nodes.walls, *(plane.walls for plane in planes)) for wall in walls]
 
 
-class HeldPlanes(PlaneContact):
-    """Walls at right angles to an axis that what flows never leaves: their columns are always held."""
+def with_tied_columns(nodes: N) -> N:
+    """The nodes whose walls that are never left hold the columns too that other walls tie to theirs: else what these
+    move would be left behind."""
 
-    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
-        del nodes, explicit
-        return True
+    def tied(wall: WallImage) -> WallImage:
+        if wall.held is None:
+            return wall
+        columns = wall.held.astype(nodes.mass.dtype)
+        for other in walls_of(nodes):
+            columns = columns if other.axis == wall.axis else other.united(columns, whole=True)
+        return replace(wall, held=columns > 0)
 
-    def likely_held(self, held: ConstrainedNodes, v: NodeVector) -> Array:
-        """With the columns that other walls tie to them: else what these move would be left behind."""
-        columns = self.shut.astype(v.dtype)
-        for wall in _walls_of(held.unconstrained):
-            columns = columns if wall.axis == self.axis else wall.united(columns, whole=True)
-        return columns > 0
+    return replace(nodes, walls=tuple(tuple(map(tied, walls)) for walls in nodes.walls))
 
-    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> Array:
-        del held
-        return jnp.zeros(self.shut.shape, v.dtype)
 
-    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Array:
-        del held
-        return jnp.zeros(self.shut.shape, residual.dtype)
-
-    def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
-        del held
-        return noise, noise
-
-    def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """None: what follows has no force of its own."""
-        del active
-        return jnp.zeros(shape, bool)
+def wall_images(
+    planes: tuple[FlatWall, ...], faces: Faces, grid: Grid, window: Int[Array, "d"], *, sticks: bool = False
+) -> tuple[WallImage, ...]:
+    """The maps of planes for what flows (see `wall_image`)."""
+    order, filled = len(faces.stencil.basis.knots) - 1, (faces.stencil, faces.flowing_volume)
+    return tuple(wall_image(*plane, grid, window, order, filled, sticks=sticks) for plane in planes)
 
 
 def column_weight(wall: WallImage, mass: NodeScalar) -> Array:
@@ -163,23 +154,8 @@ def plane_contact(
     inward: tuple[Array | int, ...],
     friction: Scalar | None,
     around: Float[Array, "n s"],
-    kind: type[PlaneContact] = PlaneContact,
 ) -> PlaneContact:
     """The contact of walls across an axis with the columns around particles whose gap is shut, where the weights of
     those have a sum, shape (n, s)."""
-    shut = [wall.column(wall.rows(around[:, k])) > 0 for k, wall in enumerate(walls)]
-    return kind(walls, inward, friction, jnp.concatenate(shut, axis=-1))
-
-
-def fluid_walls(
-    axis: int,
-    places: tuple[tuple[Scalar, Array | int], ...],
-    faces: Faces,
-    grid: Grid,
-    window: Int[Array, "d"],
-    *,
-    sticks: bool = False,
-) -> tuple[WallImage, ...]:
-    """The maps of walls across an axis, of coordinates [m] and inward normals, for what flows (see `wall_image`)."""
-    order, filled = len(faces.stencil.basis.knots) - 1, (faces.stencil, faces.flowing_volume)
-    return tuple(wall_image(axis, at, inward, grid, window, order, filled, sticks=sticks) for at, inward in places)
+    shut = [wall.columns_around(around[:, k]) for k, wall in enumerate(walls)]
+    return PlaneContact(walls, inward, friction, jnp.concatenate(shut, axis=-1))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import reduce
+from itertools import chain
 from typing import ClassVar
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from mpmjax._types import Array, Bool, Corner, Float, Int, NodeVector, ParticleV
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._plane_contact import SHUT, HeldPlanes, fluid_walls, plane_contact
+from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
 from mpmjax.boundary._surface_contact import SIGNS, Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
 from mpmjax.discretisation import Grid, scatter
@@ -71,6 +72,11 @@ class AbstractBox(AbstractBoundary):
         first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
         return (first_free - reach - ON_THE_WALL) * spacing
 
+    def across(self, axis: int) -> tuple[FlatWall, FlatWall]:
+        """The two walls across an axis."""
+        lower, upper = jnp.asarray(self.lower)[axis], jnp.asarray(self.upper)[axis]
+        return (axis, lower, 1), (axis, upper, -1)
+
     def walls(self) -> tuple[Wall, ...]:
         return tuple(
             Wall(axis, float(at), inward)
@@ -86,9 +92,6 @@ class AbstractHoldingBox(AbstractBox):
 
     motion: eqx.AbstractVar[Motion | None]
     """How the walls move together; None for not at all."""
-    sticks: ClassVar[bool]
-    """Whether they hold the whole velocity."""
-    sees_fluids: ClassVar[bool] = True
 
     def __check_init__(self):
         require_fields(self)
@@ -109,22 +112,9 @@ class AbstractHoldingBox(AbstractBox):
             fixed = jnp.broadcast_to(fixed.any(axis=1, keepdims=True), nodes.shape)
         return held_by_wall(fixed, self.motion, nodes, t, dt)
 
-    def contacts(
-        self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
-    ) -> tuple[AbstractContact, ...]:
-        """Two walls an axis that hold the columns of nodes around what flows."""
-        if faces is None or self.motion is not None or not faces.flowing.any():
-            return ()
-        around, contacts = None, []
-        if not faces.flowing.all():
-            flowing = jnp.broadcast_to(faces.flowing, (2, len(faces.x))).astype(faces.x.dtype)
-            around = scatter(faces.stencil, flowing, None, grid.size)
-        for axis in range(self.dim):
-            places = (jnp.asarray(self.lower)[axis], 1), (jnp.asarray(self.upper)[axis], -1)
-            walls = fluid_walls(axis, places, faces, grid, window, sticks=self.sticks)
-            every = jnp.ones((grid.size, 2)) if around is None else around
-            contacts.append(plane_contact(walls, SIGNS, None, every, HeldPlanes))
-        return tuple(contacts)
+    def planes(self) -> tuple[FlatWall, ...]:
+        """Two an axis, while they rest."""
+        return () if self.motion is not None else tuple(chain.from_iterable(map(self.across, range(self.dim))))
 
 
 class StickyBox(AbstractHoldingBox):
@@ -165,7 +155,6 @@ class SlipBox(AbstractHoldingBox):
     lower: Corner
     upper: Corner
     motion: Motion | None = None
-    sticks: ClassVar[bool] = False
 
 
 class SeparatingBox(AbstractBox):
@@ -231,8 +220,7 @@ class SeparatingBox(AbstractBox):
         for axis, surface in enumerate(surfaces):
             if not (faces.explicit and flowing.all()):
                 contacts.append(replace(surface, beside=~shut[axis]))
-            places = (jnp.asarray(self.lower)[axis], 1), (jnp.asarray(self.upper)[axis], -1)
-            walls = fluid_walls(axis, places, faces, grid, window)
+            walls = wall_images(self.across(axis), faces, grid, window)
             contacts.append(plane_contact(walls, SIGNS, self.friction, around[:, 2 * axis : 2 * axis + 2]))
         return tuple(contacts)
 

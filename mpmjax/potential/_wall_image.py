@@ -1,12 +1,10 @@
 """Walls that lie anywhere across an axis: the map of the nodes about them, linear across the wall."""
 
-from functools import reduce
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.discretisation import Grid, Stencil
 
 
@@ -22,7 +20,6 @@ class WallImage(eqx.Module):
     layers: int = eqx.field(static=True)  # layers of nodes, one a body
     axis: int = eqx.field(static=True)  # the wall's normal
     start: Int[Array, ""]  # the first row's number along the axis
-    b: Int[Array, ""]  # the number of the row b
     base: Bool[Array, "..."]  # the row b
     follows: Bool[Array, "..."]  # the rows behind b, which have its normal velocity times B
     share: Float[Array, "..."]  # B of b, which is 1, and of the rows behind it; zero at others
@@ -37,27 +34,33 @@ class WallImage(eqx.Module):
 
     def rows(self, field: Array) -> Array:
         """The rows of a field."""
-        return self._rows(self.blocks(field), self.start, self.share.shape[self.axis + 1])
+        blocks, count = self.blocks(field), self.share.shape[self.axis + 1]
+        return jax.lax.dynamic_slice_in_dim(blocks, self.start, count, self.axis + 1, allow_negative_indices=False)
 
-    def row(self, field: Array) -> Array:
-        """The row b of a field."""
-        return self._rows(self.blocks(field), self.b, 1)
+    def row(self, rows: Array) -> Array:
+        """The row b of some rows, as columns."""
+        return self.column(jnp.where(self.base, rows, 0))
 
     def with_rows(self, field: Array, rows: Array) -> Array:
-        """A field with other rows."""
-        blocks, axis, length = self.blocks(field), self.axis + 1, rows.shape[self.axis + 1]
-        # Laid into zeros first: XLA writes a slice over the field in place, of which the rows' own program still reads,
-        # behind an optimization_barrier too.
-        laid = jax.lax.dynamic_update_slice_in_dim(
-            jnp.zeros_like(blocks), rows, self.start, axis, allow_negative_indices=False
-        )
-        j = jax.lax.broadcasted_iota(jnp.int32, blocks.shape, axis) - self.start
-        return jnp.where((j >= 0) & (j < length), laid, blocks).reshape(field.shape)
+        """A field with other rows. XLA writes them over the field, in the loop that computes them: they may depend on
+        the row's own values, and on sums over rows (`column`)."""
+        blocks, axis = self.blocks(field), self.axis + 1
+        laid = jax.lax.dynamic_update_slice_in_dim(blocks, rows, self.start, axis, allow_negative_indices=False)
+        return laid.reshape(field.shape)
 
     def column(self, rows: Array) -> Array:
-        """The sum over the rows of each column, as columns."""
-        axis = self.axis + 1  # term by term, which XLA makes part of what reads the sum
-        return reduce(jnp.add, (jax.lax.slice_in_dim(rows, k, k + 1, axis=axis) for k in range(rows.shape[axis])))
+        """The sum over the rows of each column, as columns. XLA computes it before what reads it."""
+        return rows.sum(axis=self.axis + 1, keepdims=True)
+
+    def columns_around(self, weights: NodeScalar) -> Bool[Array, "..."]:
+        """The columns where some weights of nodes, shape (n,), have a sum in the rows."""
+        return self.column(self.rows(weights)) > 0
+
+    def reached(self, shape: tuple[int, ...]) -> Mask:
+        """All components of velocity of b and of what follows it, a mask of this shape (n, d)."""
+        mask = (self.base | self.follows) & (True if self.held is None else self.held)
+        nodes = jnp.zeros((self.layers, *self.shape, 1), bool)
+        return jnp.broadcast_to(self.with_rows(nodes, self.rows(nodes) | mask).reshape(-1, 1), shape)
 
     def scalar(self, field: Array) -> Array:
         """B for an even scalar field."""
@@ -86,17 +89,14 @@ class WallImage(eqx.Module):
         none on what follows: Σ B² m across the wall, shape (n, d + 1)."""
         return self._gathered(masses, *self._components(jnp.arange(masses.shape[1]) == self.axis, self.share**2))
 
-    def _rows(self, blocks: Array, start: Array, count: int) -> Array:
-        return jax.lax.dynamic_slice_in_dim(blocks, start, count, self.axis + 1, allow_negative_indices=False)
-
     def _components(self, normal: Bool[Array, "c"], share: Array) -> tuple[Array, Array]:
         """Which rows follow b in each component, and by which factor."""
         normal = normal | self.sticks
         return jnp.where(normal, self.follows, self.tied), jnp.where(normal, share, 1)
 
     def _copied(self, field: Array, follows: Array, factor: Array | int) -> Array:
-        follows = follows if self.held is None else follows & self.held
-        return self.with_rows(field, jnp.where(follows, factor * self.row(field), self.rows(field)))
+        follows, rows = follows if self.held is None else follows & self.held, self.rows(field)
+        return self.with_rows(field, jnp.where(follows, factor * self.row(rows), rows))
 
     def _gathered(self, field: Array, follows: Array, factor: Array | int) -> Array:
         follows, rows = follows if self.held is None else follows & self.held, self.rows(field)
@@ -133,10 +133,11 @@ def wall_image(
     count = min(order + 3, length)  # from b to the nodes of what is a spacing behind the wall
     place = jnp.asarray(position) / grid.spacing  # then from the window's first node, of a wall that is none far off
     place = jnp.clip(place - window[axis].astype(place.dtype), -length, 2 * length)
-    base = inward * (jnp.floor(inward * place + max(order - 1, 1) / 2 - near).astype(jnp.int32) + 1)
+    sign = jnp.asarray(inward, place.dtype)
+    base = inward * (jnp.floor(sign * place + max(order - 1, 1) / 2 - near).astype(jnp.int32) + 1)
     start = jnp.clip(jnp.where(inward > 0, base - count + 1, base), 0, length - count)
     j = start + jnp.arange(count, dtype=jnp.int32)
-    before, of_base = (inward * (row.astype(place.dtype) - place) for row in (j, base))
+    before, of_base = (sign * (row.astype(place.dtype) - place) for row in (j, base))
     follows, stays = inward * (j - base) < 0, before > -0.25 - near
     if filled is not None:
         along, volume = filled[0].along(axis), filled[1]
@@ -146,7 +147,7 @@ def wall_image(
             for n, slope in enumerate(along.weight_derivatives[0]):
                 node = along.first[0] + n
                 part = jnp.where(inward * (node - base) <= 0, slope, 0)
-                force, moment = force + part, moment + part * inward * (node.astype(place.dtype) - place)
+                force, moment = force + part, moment + part * sign * (node.astype(place.dtype) - place)
             total, first = jnp.stack([force, moment]) @ volume  # a product, of which XLA makes vectors
             return jnp.clip(jnp.where(total == 0, 0, first / jnp.where(total == 0, 1, total)), -0.02, 0.02)
 
@@ -159,7 +160,6 @@ def wall_image(
         layers=grid.layers,
         axis=axis,
         start=start,
-        b=jnp.clip(base, 0, length - 1),
         base=(j == base).reshape(by_row),
         follows=follows.reshape(by_row),
         share=jnp.where(j == base, 1, jnp.where(follows, before / of_base, 0)).reshape(by_row),

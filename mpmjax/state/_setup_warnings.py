@@ -59,8 +59,11 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
                 why = ", or nearer to it than a quarter of their width: it pushes their faces away, half a width"
                 why += " before their centres. Move one of them."
             warn(f"{inside} of {len(x)} particles lie in or beyond the {name} at the start{why}")
-        if any(law.flows for law in scene.laws) and (told := _unfit_for_fluids(condition, dx)):
-            warn(f"The {name} {told}")
+        if any(law.flows for law in scene.laws) and _stirs_fluids(condition):
+            warn(
+                f"The {name} pushes the faces of a fluid and so stirs it, by a tenth or more of the pressure at its "
+                "floor: across an axis take a SymmetryPlane, ContactPlane or SeparatingBox."
+            )
         if mask is not None:
             may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
             if not may_meet:  # only the nodes in a particle's stencil
@@ -184,22 +187,11 @@ def _probe(
     return [covered(b) for b in boundary], [touched(b) if r else None for b, r in zip(boundary, resting, strict=True)]
 
 
-def _unfit_for_fluids(boundary: AbstractBoundary, dx: float) -> str | None:
-    """The end of a warning of a boundary at rest across an axis at which fluids find no rest, or not where it is; None
-    of others."""
-    shape, instead = getattr(boundary, "shape", None), "take a SymmetryPlane, ContactPlane or SeparatingBox"
-    places = [wall.position for wall in boundary.walls() if not wall.mirrored]
-    if isinstance(shape, HalfSpace):
-        point, normal = (np.asarray(jnp.asarray(a), float) for a in (shape.point, shape.normal))
-        places = point[normal != 0].tolist() if np.count_nonzero(normal) == 1 else []
-    if getattr(boundary, "motion", None) is not None or boundary.sees_fluids or not places:
-        return None
-    if boundary.pushes:
-        stirs = "pushes the faces of a fluid and so stirs it, by a tenth or more of the pressure at its floor: across"
-        return f"{stirs} an axis {instead}." if boundary.collider_count else None
-    beside = np.abs(np.asarray(places) / dx - np.round(np.asarray(places) / dx)) > ON_THE_WALL
-    holds = "lies between nodes and holds a fluid at those behind it, up to a spacing further: move it to nodes, or"
-    return f"{holds} {instead}." if beside.any() else None
+def _stirs_fluids(boundary: AbstractBoundary) -> bool:
+    """Whether it is a collider at rest across an axis at which fluids find no rest."""
+    shape, rests = getattr(boundary, "shape", None), getattr(boundary, "motion", None) is None
+    across = isinstance(shape, HalfSpace) and np.count_nonzero(jnp.asarray(shape.normal)) == 1
+    return bool(boundary.pushes and rests and across)
 
 
 def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Any) -> Any:

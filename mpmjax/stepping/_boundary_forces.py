@@ -1,5 +1,7 @@
 """The impulse that each boundary of a scene receives in a step, from the motion of the nodes and what made it."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 
@@ -12,7 +14,7 @@ from mpmjax.boundary import (
     taken_by_mirrors,
 )
 from mpmjax.discretisation import Gathered
-from mpmjax.potential import Image, Mirror
+from mpmjax.potential import Image, Mirror, WallImage
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping._grid_update import GridUpdate, reaction
 from mpmjax.stepping._integrator import AbstractIntegrator
@@ -30,7 +32,12 @@ def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator,
         pivots = pivots + share * nodes.dt * colliders.pivot_velocity
     held, numbers = new.held(nodes), _boundaries_of_colliders(scene)
     holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
-    parts = [OwnedImpulse(holding, colliders.holder), *held.along_normals(holding)]
+    parts = list(held.along_normals(holding))
+    of_walls, holding = taken_by_mirrors(held.without_collider_impulses(holding), _walls_of(nodes))
+    for part in of_walls:
+        if isinstance(part.owner, int) and part.owner in numbers:
+            parts.append(replace(part, owner=numbers.index(part.owner)))
+    parts.append(OwnedImpulse(holding, colliders.holder))
     mass, tied = (nodes if nodes.loose is None else nodes.loose).mass[:, None], Mirror(nodes.tied)
     for number, contact, active, change in zip(
         nodes.brought_by, nodes.contacts, held.active, new.friction, strict=True
@@ -100,12 +107,8 @@ def impulse_on_boundaries(
     for part in held.along_normals(residual):
         parts.append(OwnedImpulse(part.impulse, jnp.where(part.owner < 0, -1, numbers[part.owner])))
         residual = residual - part.impulse
-    columns = [
-        (number, image)
-        for number, contact, active in contacts
-        if number is not None
-        for image in contact.images(active)
-    ]
+    brought = [(number, contact.images(active)) for number, contact, active in contacts if number is not None]
+    columns = [*((number, image) for number, images in brought for image in images), *_walls_of(nodes)]
     of_planes, residual = taken_by_mirrors(residual, columns)
     parts += [*of_planes, OwnedImpulse(residual, owners)]
     taken = owners >= 0
@@ -136,6 +139,11 @@ def impulse_on_boundaries(
         places = places + force_at * dt * carried
         pivots = pivots + force_at * (_pivots(scene, t + dt, residual) - pivots)
     return received_impulses(parts, places, pivots, couples)
+
+
+def _walls_of(nodes: Nodes) -> list[tuple[int, WallImage]]:
+    """The walls that hold what flows at all times, with the numbers of their boundaries."""
+    return [(number, wall) for number, walls in enumerate(nodes.walls) for wall in walls]
 
 
 def _boundaries_of_colliders(scene: Scene) -> list[int]:

@@ -17,10 +17,11 @@ from mpmjax.boundary import (
     FreeNormal,
     combined_conditions,
     mirror,
+    with_tied_columns,
 )
 from mpmjax.discretisation import Stencil, in_section, in_space, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
-from mpmjax.potential import AbstractTerm, Forces, Mirror
+from mpmjax.potential import AbstractTerm, Forces, Mirror, WallImage
 from mpmjax.state import AbstractLayerImage, Particles, Scene, load_force, points_of, terms_of
 from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
 
@@ -37,6 +38,7 @@ class Nodes(AbstractNodes):
     potential: ElasticPotential  # Φ, a function of nodal displacements
     conditions: Conditions  # the conditions that the boundaries prescribe
     contacts: tuple[AbstractContact, ...] = ()  # the contacts of the scene; none of them is active here
+    walls: tuple[tuple[WallImage, ...], ...] = ()  # the walls of each boundary that are never left
     brought_by: tuple[int | None, ...] = eqx.field(static=True, default=())
     """The number of the boundary that brings each contact; None for that of two bodies."""
     loose: "Nodes | None" = None  # the nodes before the constraints of bodies; None without any
@@ -241,22 +243,24 @@ def with_boundaries(
         moved = places_of(particles, potential.stencil, grid.size)
         place = jnp.where(slid[:, None] & nodes.occupied, moved, conditions.colliders.position)
         conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
-    faces = None
-    flows = any(law.flows for law in scene.laws)
-    if any(wall.pushes or wall.sees_faces or (flows and wall.sees_fluids) for wall in scene.boundary):
+    faces, walls, flows = None, (), any(law.flows for law in scene.laws) and any(b.planes() for b in scene.boundary)
+    if flows or any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
         faces = faces_of(scene, particles, potential, t, dt, force_at)
+        walls = tuple(boundary.fluid_walls(faces, grid, window) for boundary in scene.boundary) if flows else ()
     each = enumerate(scene.boundary)
     brought = [(n, contact) for n, boundary in each for contact in boundary.contacts(faces, grid, window, t, dt)]
     contacts, brought_by = [contact for _, contact in brought], [number for number, _ in brought]
     if scene.bodies is not None:
         images = mirror(scene.boundary, grid, window)
         contacts += contacts_of_bodies(scene, scene.bodies.friction, particles, potential, images, dt, force_at)
-    return replace(
+    nodes = replace(
         nodes,
         conditions=conditions,
         contacts=tuple(contacts),
+        walls=walls,
         brought_by=(*brought_by, *[None] * (len(contacts) - len(brought_by))),
     )
+    return with_tied_columns(nodes) if walls else nodes
 
 
 def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar) -> Nodes:

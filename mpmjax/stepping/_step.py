@@ -116,7 +116,7 @@ step_compiled = eqx.filter_jit(step_unchecked)
 
 def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     """The grid update by an integrator, with contact and friction where the scene has any."""
-    if nodes.contacts:
+    if nodes.contacts or nodes.walls:
         new = constrained_update(nodes, method)
     else:
         motion, info = method.advance(nodes, method.initial_guess(nodes))
