@@ -3,12 +3,12 @@ as it was, and of contact at the particles' faces, as it is.
 
     python benchmarks/contact_surface.py            prints the tables (minutes)
     python benchmarks/contact_surface.py --quick    one grid (a minute)
-    python benchmarks/contact_surface.py --only block    one of rest, bar, block
+    python benchmarks/contact_surface.py --only block    one of rest, bar, block, ball
 
 A bar, or a square block, falls on a plain wall that lies anywhere between nodes. Its mean velocity tells
 when the wall has given 2 and 98 % of its impulse; by the exact solution of the bar, the time between is 0.96 of 2L/c,
 and the first comes 0.04 L/c after its face is at the wall. The reference of the block is the same block at four times
-the resolution.
+the resolution. A ball, in its section, is thrown at a plane and compared with Hertz's contact.
 """
 
 import argparse
@@ -197,7 +197,63 @@ def _rms(errors: np.ndarray) -> np.ndarray:
     return np.sqrt((errors**2).mean(axis=0))
 
 
-TABLES = {"rest": rests, "bar": bars, "block": blocks}
+def ball(cells: int, wall: str, *, at=0.0, gap=0.6, nu=0.3, depth=0.05, fitted=True) -> dict[str, float]:
+    """A ball of so many cells a radius, `gap` spacings above a plane `at` spacings from a node, that hits it so fast
+    that by Hertz's F = 4/3 E* √R d^1.5 it is pressed in by `depth` radii: the peak force, as a mean over an eighth of
+    the time of contact, and the time between 2 and 98 % of the impulse, over Hertz's."""
+    dx, law = 1.0 / cells, mpm.NeoHookean(1.0, nu)
+    grid = mpm.Grid((int(1.15 * cells) + 5, int(2.3 * cells) + 10), dx, origin=(-2, -4), axisymmetric=True)
+    mass, stiffness = 4 / 3 * np.pi, 4 / 3 / (1 - nu**2)
+    v0 = np.sqrt(4 / 5 * stiffness * depth**2.5 / mass)
+    whole = mpm.Ball((0.0, 1 + (at + gap) * dx), 1.0)
+    body = mpm.fill(whole, grid, density=1.0, velocity=(0.0, -v0), fitted=fitted)
+    floor = {
+        "SeparatingBox": mpm.SeparatingBox((-INF, at * dx), (INF, INF)),
+        "SeparatingCollider": mpm.SeparatingCollider(mpm.HalfSpace((0.0, at * dx), (0.0, 1.0))),
+        "ContactPlane": mpm.ContactPlane(1, at * dx),
+    }[wall]
+    lasts = 2.943 * depth / v0
+    dt = 0.3 * dx / np.sqrt((1 - nu) / (1 + nu) / (1 - 2 * nu))
+    steps = int((gap * dx / v0 + 1.4 * lasts) / dt)
+    run = mpm.simulate(
+        mpm.Scene(grid, law, boundary=floor),
+        body,
+        t1=steps * dt,
+        dt=dt,
+        observe=lambda _, now: (now.mass * now.v[:, 1]).sum() / now.mass.sum(),
+    )
+    # Hertz's motion, m ẍ = −K x^1.5, by small steps
+    fine, x, v = lasts / 20000, 0.0, [v0]
+    while x >= 0:
+        v.append(v[-1] - fine * stiffness * x**1.5 / mass)
+        x += fine * v[-1]
+    seen = _impact(np.arange(steps + 1) * dt, -np.asarray(run.observed), lasts / 8)
+    return dict(zip(("force", "time"), seen / _impact(np.arange(len(v)) * fine, np.array(v), lasts / 8), strict=True))
+
+
+def _impact(t: np.ndarray, v: np.ndarray, width: float) -> np.ndarray:
+    """The largest mean deceleration over a `width` of time, and the time between 2 and 98 % of the impulse."""
+    part, starts = (v[0] - v) / (v[0] - v[-1]), np.linspace(t[0], t[-1] - width, 4000)
+    first, last = (np.interp(share, part[: (k := int(np.argmax(part > share)) + 1)], t[:k]) for share in (0.02, 0.98))
+    return np.array([(np.interp(starts, t, v) - np.interp(starts + width, t, v)).max() / width, last - first])
+
+
+def balls(quick: bool) -> None:
+    print("\nA ball on a plane, over Hertz's; pressed in by a twentieth of its radius, ν = 0.3, but where said:")
+    print("the range over the plane's places between nodes, of a ball on a lattice over its own too")
+    choices = {"fitted": {}, "lattice": {"fitted": False}, "ν = 0.45": {"nu": 0.45}, "a tenth": {"depth": 0.1}}
+    for name, choice in choices.items():
+        rows = []
+        for cells, wall in itertools.product((8,) if quick else (4, 8, 16, 32), list(WALLS)[1:]):
+            some = places(wall, 0.0, 0.25, 0.5) if name == "fitted" and cells < 16 else [0.0]
+            gaps = (0.6, 0.7, 0.85, 0.95) if name == "lattice" and cells < 16 else (0.6,)
+            found = [ball(cells, wall, at=a, gap=gap, **choice) for a in some for gap in gaps]
+            ranges = (w([f[k] for f in found]) for k in ("force", "time") for w in (min, max))
+            rows.append((f"{wall} {cells}", *ranges))
+        _print(rows, (name, "force from", "to", "time from", "to"))
+
+
+TABLES = {"rest": rests, "bar": bars, "block": blocks, "ball": balls}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -103,7 +103,7 @@ __version__ = "0.1.0"
 
 _LATE = {
     "analysis": "budget energy momentum stress",
-    "cli": "load_scene",
+    "cli": "load_scene save_scene",
     "fitting": "Bounded Curve Experiment Positive Series Tracks Unbounded fit",
     "io": "load record register save table",
     "simulation": "Run SimulationError rollout simulate",
@@ -121,7 +121,7 @@ if TYPE_CHECKING:
         viz as viz,
     )
     from mpmjax.analysis import budget as budget, energy as energy, momentum as momentum, stress as stress
-    from mpmjax.cli import load_scene as load_scene
+    from mpmjax.cli import load_scene as load_scene, save_scene as save_scene
     from mpmjax.fitting import (
         Bounded as Bounded,
         Curve as Curve,

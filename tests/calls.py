@@ -78,6 +78,7 @@ FUNCTIONS = {
     mpm.load: {"path": "never.h5"},
     mpm.table: {"run": "never.h5"},
     mpm.load_scene: {"path": "never.toml"},
+    mpm.save_scene: RUN | {"path": "never/never.toml"},
     mpm.render: {"run": None, "path": "never.png"},
     mpm.analysis.work_precision: {"build": reached, "t1": 0.1},
     mpm.Experiment: RUN | {"observations": SEEN},

@@ -173,11 +173,11 @@ def test_a_change_is_made_at_its_place(folder):
 
 
 def test_options_of_run_stand_for_keys_of_the_file(folder, tmp_path):
-    options = ("--dt", 2e-3, "--steps", 4, "--method", "BackwardEuler", "--set", "material.youngs_modulus=2e5")
+    options = ("--dt", 2e-3, "--steps", 4, "--method", "Explicit", "--set", "material.youngs_modulus=2e5")
     code, _, err = shell("run", folder / "scene.toml", "-o", tmp_path / "run.h5", "--quiet", *options)
     assert code == 0, err
     run = mpm.load(tmp_path / "run.h5")
-    assert (float(run.dt), int(run.final_step), type(run.method)) == (2e-3, 4, mpm.BackwardEuler)
+    assert (float(run.dt), int(run.final_step), type(run.method)) == (2e-3, 4, mpm.Explicit)
     assert float(run.scene.material.youngs_modulus) == 2e5
 
 
@@ -324,6 +324,38 @@ def test_an_example_is_copied_with_its_data(tmp_path, monkeypatch):
     with open("examples/rubber.toml", "a") as file:
         file.write("# mine")
     assert "examples/rubber.toml exists and differs" in refused("example", "rubber.toml")
+
+
+def test_a_scene_of_python_is_a_scene_file(tmp_path):
+    """With its particles in the midst of a run: what is loaded is what was saved, bit for bit. Nothing that is there is
+    replaced, and refinement has no region to fill."""
+    grid = mpm.Grid((12, 14), 0.1, origin=(-3, -3))
+    lower, upper = mpm.Box((0.0, 0.0), (0.3, 0.3)), mpm.Box((0.0, 0.35), (0.3, 0.6))
+    particles = mpm.join(*(mpm.fill(box, grid, particles_per_cell=4, density=1e3) for box in (lower, upper)))
+    laws = {"soft": mpm.NeoHookean(1e5, 0.3), 'clay \\ "wet"': mpm.VonMises(2e5, 0.3, 1e2, 0.0)}
+    boundary = mpm.SlipBox((-0.2, -np.inf), (0.6, np.inf)), mpm.Grip(lower, mpm.Motion((0.0, 1.0), ((0, 0), (0.1, 0))))
+    loads = mpm.Traction(mpm.Patch(upper, within=mpm.Box((-1.0, 0.55), (1.0, 0.7))), (0.0, 9.0))
+    scene = mpm.attach(mpm.Scene(grid, laws, gravity=(0.0, -9.81), boundary=boundary, loads=loads), particles)
+    settings = {"t1": 5e-4, "dt": 1e-4, "method": mpm.Explicit(), "save_every": 5}
+    start = mpm.simulate(scene, particles, **settings).final
+    path = tmp_path / "made.toml"
+    mpm.save_scene(path, scene, start, **settings)
+    loaded, same, told = mpm.load_scene(path)
+    assert told == settings
+    for saved, read in ((scene, loaded), (start, same)):
+        assert jax.tree.structure(saved) == jax.tree.structure(read)
+        for a, b in zip(jax.tree.leaves(saved), jax.tree.leaves(read), strict=True):
+            np.testing.assert_array_equal(a, b)
+    with pytest.raises(ValueError, match=r"made\.toml exists"):
+        mpm.save_scene(path, scene, start, **settings)
+    with pytest.raises(ValueError, match="cannot be refined"):
+        read_scene_file(path).build(2)
+    text = path.read_text()
+    path.write_text(text.replace("start.vtkhdf", "lost.vtkhdf"))
+    assert "made.lost.vtkhdf" in refused("check", path)
+    method = mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(rtol=1e-9))
+    mpm.save_scene(tmp_path / "implicit.toml", scene, start, t1=1.0, dt="stable", method=method)
+    assert read_scene_file(tmp_path / "implicit.toml").run.method == method
 
 
 def test_a_scene_is_loaded_as_the_shell_runs_it(folder):

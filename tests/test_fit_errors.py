@@ -267,7 +267,7 @@ class Line(FitProblem):
         whole = FitProblem((thrown(seen),), {"a": parameter, "b": SPEED})
         self.experiments, self.names = whole.experiments, whole.names
         self.parameters, self.starts = whole.parameters, whole.starts
-        self.y, self.A = jnp.asarray(y), LINE
+        self.y, self.A, self.plane = jnp.asarray(y), LINE, None
 
     def residuals(self, z, sigmas, adjoint):
         return jnp.asarray(self.A, z.dtype) @ self.numbers(z) - jnp.asarray(self.y, z.dtype), jnp.zeros(1)

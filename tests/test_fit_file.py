@@ -303,7 +303,11 @@ FAULTS = {
         r"a name",
     ),
     "refinement": ("t1 = 0.048", "t1 = 0.048\nrefine = 0", r"refine must be growing whole numbers"),
-    "optimiser": ("t1 = 0.048", 't1 = 0.048\noptimiser = "Newton"', r"optimiser must have a kind, one of Levenberg"),
+    "optimiser": (
+        "t1 = 0.048",
+        't1 = 0.048\noptimiser = "Newton"',
+        r"optimiser: .* 'Newton'\. It must be one of Adam, LBFGS, Lev",
+    ),
     "tolerance": ("t1 = 0.048", 't1 = 0.048\noptimiser = { kind = "LevenbergMarquardt", rtol = -1.0 }', r"rtol"),
     "path and kind": ('unit = "Pa"', 'kind = "Velocity"', r"takes no path"),
     "no path": ('path = "scene.material.youngs_modulus"', "", r"needs a path"),

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from helpers import assert_close, ids, rotation_matrix, thorough
 
-from mpmjax.linalg._spectral import Logarithm, PowerLessOne
+from mpmjax.linalg._spectral import Logarithm, PowerBeyondLine, PowerLessOne
 
-FUNCTIONS = {"logarithm": Logarithm()} | {
-    f"power {a}": PowerLessOne(jnp.array([a]), jnp.array([c])) for a, c in ((-0.4, 0.3), (-1e-9, 1e-8), (1.7, -0.2))
-}
+POWERS = (-0.4, 0.3), (-1e-9, 1e-8), (1.7, -0.2)
+FUNCTIONS = {f"power {a}": PowerLessOne(jnp.array([a]), jnp.array([c])) for a, c in POWERS}
+FUNCTIONS |= {"logarithm": Logarithm(), "beyond line": PowerBeyondLine(jnp.array([0.3]), jnp.array([-0.2]))}
 EIGENVALUES = {
     "all one": (1.0, 1.0, 1.0),
     "two equal": (1.3, 1.3, 0.4),
@@ -61,7 +61,8 @@ def test_values_are_those_of_lapacks_eigenvectors(eigenvalues, d, f):
     S, *directions = case(eigenvalues, d)
     value = evaluated(f, S, *directions)[0]
     s, V = np.linalg.eigh(S[..., 0])
-    of = np.log(s) if isinstance(f, Logarithm) else np.expm1(f.exponent[0] * np.log(s) + f.shift[0])
+    y = np.log(s) if isinstance(f, Logarithm) else np.asarray(f.exponent[0] * np.log(s) + f.shift[0])
+    of = y if isinstance(f, Logarithm) else np.expm1(y) - (y if isinstance(f, PowerBeyondLine) else 0)
     assert_close(value[..., 0], (V * of) @ V.T, 1e-13, atol=4e-15 if isinstance(f, Logarithm) else 0)
 
 

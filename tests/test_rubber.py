@@ -167,6 +167,8 @@ def test_ogdens_terms_have_the_shear_moduli_that_they_are_given():
     assert (again.exponents, again.bulk_modulus) == (law.exponents, law.bulk_modulus)
     x, flat = jnp.asarray([0.7, 1.2, 4.0]), mpm.Ogden((1.0,), (1e-9,), 1.0).with_shear_moduli((3.0,))
     np.testing.assert_allclose(tension(flat, x, "uniaxial"), 9 * np.log(x) / x, rtol=1e-6)
+    pulled = jnp.eye(3)[..., None] * jnp.stack([x, x**-0.5, x**-0.5])[:, None]
+    np.testing.assert_allclose(flat.energy(pulled), 3 * 1.5 * np.log(x) ** 2, rtol=1e-8)
 
 
 class Tension(FitProblem):

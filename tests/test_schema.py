@@ -82,7 +82,13 @@ EXAMPLES = {
     mpm.Patch: PATCH,
     mpm.PointsAt: mpm.PointsAt(((0.1, 0.2), (0.3, 0.4)), (0.25, 0.75)),
     mpm.state.AttachedPoints: mpm.state.AttachedPoints(
-        np.zeros(1), np.ones((1, 2)), np.ones(1), np.full((1, 2), 0.3), np.array([[0.0, 1.0]])
+        np.zeros((2, 1)),
+        np.ones((1, 2)),
+        np.ones(1),
+        np.full((1, 2), 0.3),
+        np.array([[0.0, 1.0]]),
+        np.full((2, 1), 0.5),
+        np.ones((2, 1, 2)),
     ),
     mpm.TimeSeries: mpm.TimeSeries((0.0, 1.0), ((0.0, 1.0), (2.0, 3.0))),
     mpm.Motion: GRIP.motion,

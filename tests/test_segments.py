@@ -18,8 +18,9 @@ STEPS, DT = 12, 2e-3
 GRID = mpm.Grid((16, 16), 1 / 16)
 TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {"explicit": mpm.Explicit(), "backward_euler": mpm.BackwardEuler(adjoint_solver=TIGHT)}
-LENGTHS = [(12,), (5, 3), *thorough(((3, 4),), ((2, 2, 3),), ((13,),))]
-"""Of 12 steps: at once, in segments of which the last is short, in segments, in segments of segments."""
+LENGTHS = [(5, 3), *thorough(((12,),), ((3, 4),), ((2, 2, 3),), ((13,),))]
+"""Of 12 steps: in segments of which the last is short, at once (which the test of memory compares with segments), in
+segments, in segments of segments."""
 
 
 def size(q, adjoint=None, method="explicit", **options):

@@ -372,7 +372,7 @@ def test_water_that_is_let_down_on_a_floor_anywhere_neither_rises_nor_gains_ener
     assert energy[-1] < energy[0] / 2
 
 
-@pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "trbdf2")))
+@pytest.mark.parametrize("method", **ids(METHODS, "explicit"))
 def test_a_wall_that_holds_a_fluid_keeps_a_velocity_that_is_linear_across_it(method):
     """In both directions of a corner, between nodes: such a field is one of those that the walls admit, and a short
     step brings it back to the particles."""
@@ -523,10 +523,9 @@ def test_slivers_at_a_curved_edge_do_not_shorten_explicit_steps(d):
 def test_walls_that_hold_a_fluid_beside_a_solid_feel_all_that_they_take(method, kind):
     """Between nodes and in a corner: their impulse is the change of momentum that nothing else gives, and a start
     velocity has the derivative of differences. The columns of the solid are held at their nodes."""
-    after = beside_a_solid(kind, method, first=False)
-    speed = lambda scale: (after(scale)[0].v ** 2).sum()  # noqa: E731
-    difference = (speed(1 + 1e-4) - speed(1 - 1e-4)) / 2e-4
-    assert_close(jax.grad(speed)(1.0), difference, 1e-5)
+    speed = beside_a_solid(kind, method, first=False)
+    difference = (speed(1 + 1e-4)[0] - speed(1 - 1e-4)[0]) / 2e-4
+    assert_close(speed(1.0)[1], difference, 1e-5)
 
 
 @pytest.mark.parametrize("kind", ["sticky", *thorough("slip")])
@@ -536,8 +535,9 @@ def test_walls_hold_columns_together_that_meet_behind_a_solid_in_their_corner(ki
 
 
 def beside_a_solid(kind, method, *, first):
-    """A function of the start velocity's scale to a step of a fluid beside a solid, which is in the walls' first corner
-    or the last one. The walls' impulse is the change of momentum that nothing else gives."""
+    """A function of the start velocity's scale to Σ v² after a step of a fluid beside a solid, which is in the walls'
+    first corner or the last one, and to its derivative. The walls' impulse is the change of momentum that nothing else
+    gives."""
     grid, at, dt = mpm.Grid((16, 14), 0.1, origin=(-4, -4)), 0.02, 2e-3
     cuts, laws = ((at, at + 0.15), (LAW, mpm.Fluid(1e4))) if first else ((at, at + 0.4), (mpm.Fluid(1e4), LAW))
     blocks = (mpm.Box((a, at), (b, at + 0.3)) for a, b in pairwise((*cuts, at + 0.7)))
@@ -549,10 +549,12 @@ def beside_a_solid(kind, method, *, first):
 
     def after(scale):
         moving = dataclasses.replace(start, v=scale * start.v)
-        return mpm.step(scene, moving, 0.0, dt, method=method)
+        end, info = mpm.step(scene, moving, 0.0, dt, method=method)
+        return (end.v**2).sum(), (end, info)
 
-    end, info = after(1.0)
+    both = (lambda scale: (after(scale), 0.0)) if first else jax.jit(jax.value_and_grad(after, has_aux=True))
+    (_, (end, info)), _ = both(1.0)
     weight = dt * float(body.mass.sum()) * np.array([0.0, -1.0])
     change = (body.mass[:, None] * (end.v - body.v)).sum(axis=0)
     assert_close(-info.boundaries.impulse[0] + weight, change, 1e-6)
-    return after
+    return lambda scale: ((it := both(scale))[0][0], it[1])

@@ -310,9 +310,8 @@ def _budget(
         # particle and nodes beside each other
         v_old = components(before.v)
         arrived = _gathered(scene, stencil, all1)
-        change = (
-            _gathered(scene, stencil, all1 - images.unfold(new.before(nodes))) if scene.transfer.needs_change else None
-        )
+        gained = all1 - images.unfold(new.before(nodes)) if scene.transfer.needs_change else None
+        change = None if gained is None else _gathered(scene, stencil, gained)
         moved = arrived.value
         C_old, C_new = (components(q.C) if scene.transfer.affine and q.C is not None else None for q in (before, after))
         beside = scene.transfer.velocity(v_old, arrived, change) - moved

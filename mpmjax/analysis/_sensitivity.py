@@ -98,18 +98,8 @@ def sensitivity(
 
     def flown(v: ParticleVector) -> tuple[tuple[Array, Any], tuple[Array, RunStatistics]]:
         thrown = eqx.tree_at(lambda p: p.v, particles, v)
-        run = simulate(
-            scene,
-            thrown,
-            t1=t1,
-            dt=dt,
-            method=method,
-            save_every=every,
-            observe=_positions,
-            start=start,
-            adjoint=diffrax.ForwardMode(),
-            throw=False,
-        )
+        course: Any = {"t1": t1, "dt": dt, "method": method, "start": start, "save_every": every}
+        run = simulate(scene, thrown, **course, observe=_positions, adjoint=diffrax.ForwardMode(), throw=False)
         return (run.observed, run.report), (run.steps, run.statistics)
 
     _, (moved, unsolved), (steps, statistics) = jax.jvp(flown, (particles.v,), (change,), has_aux=True)
@@ -119,11 +109,8 @@ def sensitivity(
     if is_traced(report) or report.worst <= warn_at:
         return report
     if not statistics.healthy:
-        what = (
-            f"meets a fault at step {int(statistics.fault_step)}"
-            if int(statistics.fault) != Fault.NONE
-            else "does not solve its equations"
-        )
+        fault, step = int(statistics.fault), int(statistics.fault_step)
+        what = "does not solve its equations" if fault == Fault.NONE else f"meets a fault at step {step}"
         why = f"the run {what} and has no derivative from there on: see what simulate says of it."
     elif float(unsolved) > 0:
         why = (
@@ -145,7 +132,6 @@ def sensitivity(
 
 
 def _positions(scene: Scene, particles: Particles) -> ParticleVector:
-    del scene
     return particles.x
 
 

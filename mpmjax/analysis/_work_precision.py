@@ -27,14 +27,10 @@ class WorkPrecision(NamedTuple):
     """Errors against seconds, and the cheapest setting."""
 
     trials: tuple[Trial, ...]  # all runs, those that failed or were only foreseen too
-    reference: Trial
-    """The reference run; its error is an estimate."""
-    target: float
-    """The target error."""
-    limit: float
-    """The longest explicit step allowed on the scene's own grid [s], the `stable_dt` of the whole motion."""
-    skipped: tuple[str, ...] = ()
-    """Names of the methods for which there was no time."""
+    reference: Trial  # the reference run; its error is an estimate
+    target: float  # the target error
+    limit: float  # the longest explicit step allowed on the scene's own grid [s], the `stable_dt` of the whole motion
+    skipped: tuple[str, ...] = ()  # names of the methods for which there was no time
 
     def cheapest(self, *, explicit: bool | None = None) -> Trial | None:
         """The fastest trial that is good enough: of all, of the explicit ones or of the others; None if none is.

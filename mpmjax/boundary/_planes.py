@@ -18,6 +18,9 @@ from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, Motion
 from mpmjax.potential import Image, MirrorPlace, mirror_image, wall_image
 
+FAR = 0.1
+"""How far behind a contact plane a face is held whatever is beside it, in spacings."""
+
 
 class AbstractPlane(AbstractBoundary):
     """A plane beyond which nodes are mirror images."""
@@ -90,7 +93,25 @@ class AbstractPlane(AbstractBoundary):
         return (Wall(self.axis, float(self.position), self.inward, mirrored=True),)
 
 
-class SymmetryPlane(AbstractPlane):
+class AbstractMovingPlane(AbstractPlane):
+    """A plane that may move."""
+
+    motion: eqx.AbstractVar[Any]
+    """How it moves; None for not at all."""
+
+    @property
+    def dim(self) -> int | None:
+        return None if self.motion is None else self.motion.dim
+
+    def mirror(self) -> MirrorPlace:
+        return MirrorPlace(self.axis, self.position, self.motion)
+
+    def walls(self) -> tuple[Wall, ...]:
+        """Where it starts."""
+        return (Wall(self.axis, float(self.position), self.inward, mirrored=self.motion is None),)
+
+
+class SymmetryPlane(AbstractMovingPlane):
     """A plane of mirror symmetry: nodes beyond it are mirror images. It is also a frictionless wall that
     material cannot leave.
 
@@ -120,14 +141,6 @@ class SymmetryPlane(AbstractPlane):
     def __check_init__(self):
         require_fields(self)
 
-    @property
-    def dim(self) -> int | None:
-        return None if self.motion is None else self.motion.dim
-
-    def walls(self) -> tuple[Wall, ...]:
-        """Where it starts."""
-        return (Wall(self.axis, float(self.position), self.inward, mirrored=self.motion is None),)
-
     def displacement(self, t: Scalar) -> Scalar:
         return 0.0 if self.motion is None else self.motion.at(t)[self.axis]
 
@@ -137,9 +150,6 @@ class SymmetryPlane(AbstractPlane):
         on = jnp.abs(nodes[:, self.axis] - at) <= ON_THE_WALL * spacing
         fixed = jnp.zeros(nodes.shape, dtype=bool).at[:, self.axis].set(on)
         return held_by_wall(fixed, self.motion, nodes, t, dt)
-
-    def mirror(self) -> MirrorPlace:
-        return MirrorPlace(self.axis, self.position, self.motion)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """A window cannot follow the material and a plane."""
@@ -155,7 +165,7 @@ class SymmetryPlane(AbstractPlane):
         return (replace(mirror_image(self.axis, self.position, self.keep, grid, window), velocity=velocity),)
 
 
-class ClampPlane(AbstractPlane):
+class ClampPlane(AbstractMovingPlane):
     """A plane to which the body's face is fixed: a grip that holds at its surface.
 
     Nodes beyond it have the opposite of their image's velocity, so that the spline vanishes on the plane: second order
@@ -183,13 +193,6 @@ class ClampPlane(AbstractPlane):
     def __check_init__(self):
         require_fields(self)
 
-    @property
-    def dim(self) -> int | None:
-        return None if self.motion is None else self.motion.dim
-
-    def mirror(self) -> MirrorPlace:
-        return MirrorPlace(self.axis, self.position, self.motion)
-
     def check(self, grid: Grid, *, total: bool) -> None:
         """A motion needs the total description."""
         AbstractPlane.check(self, grid, total=total)
@@ -197,10 +200,6 @@ class ClampPlane(AbstractPlane):
             self.motion is None or total,
             "A ClampPlane moves in the total description only, whose nodes stay with the body: take that, or a Grip.",
         )
-
-    def walls(self) -> tuple[Wall, ...]:
-        """Where it starts."""
-        return (Wall(self.axis, float(self.position), self.inward, mirrored=self.motion is None),)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = V on the plane's own nodes."""
@@ -246,9 +245,9 @@ class ContactPlane(AbstractPlane):
     Second order in the spacing while contact lasts without friction; first order where friction shears the material at
     the wall (the mirrored tangential velocity has no slope there), and in the moment of touching and leaving.
 
-    A column is held while the face of a particle around it is behind the plane, or less than a hundredth of a spacing
-    before it. What it moves with when it is first held is lost, so an impact returns less than from a `SeparatingBox`,
-    which is the better wall for a bounce.
+    A column is held while a third of the faces around it that are near is behind the plane, or less than a hundredth
+    of a spacing before it. What it moves with when it is first held is lost, so an impact returns less than from a
+    `SeparatingBox`, which is the better wall for a bounce.
 
     *When it breaks*: as a `SymmetryPlane`. PIC and FLIP carry no velocity gradient to the grid, so with them a fast
     stretch of what touches the wall is taken for leaving it; APIC knows better. Half-way between nodes a plane is not
@@ -285,16 +284,20 @@ class ContactPlane(AbstractPlane):
     def contacts(
         self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
     ) -> tuple[AbstractContact, ...]:
-        """A mirror in the columns that a particle reaches whose gap is shut. In implicit steps, which may close much of
-        a gap at once, the faces before the plane are pushed as by a `SeparatingBox` in the step that would bring them
-        behind it."""
+        """A mirror in the columns around which a third of the faces is shut, by the kernel's weights, of those less
+        than half a particle before the plane; of what flows, or is far behind it, any. In implicit steps, which may
+        close much of a gap at once, faces before the plane are pushed as by a `SeparatingBox` in the step that would
+        bring them behind it."""
         del t, dt
         assert faces is not None  # as it `sees_faces`
         normal = jnp.zeros_like(faces.x.T).at[self.axis].set(self.inward)
         distance = self.inward * (faces.x[:, self.axis] - self.position)
         landing = surface_contact(Surface(distance, normal, self.friction, axis=self.axis), faces)
         shut = landing.gap <= SHUT * faces.spacing
-        around = scatter(faces.stencil, shut.astype(faces.x.dtype), None, grid.size)
+        # a curved face is felt where it is, and not a kernel beside its contact; twice the gap: the half-width before
+        before = (2 * landing.gap < distance) & ~faces.flowing
+        votes = jnp.where(landing.gap < -FAR * faces.spacing, 100.0, jnp.where(shut, 2.0, jnp.where(before, -1.0, 0.0)))
+        around = scatter(faces.stencil, votes.astype(faces.x.dtype), None, grid.size)
         order, position = len(faces.stencil.basis.knots) - 1, jax.lax.stop_gradient(self.position)  # the lattice goes
         wall = wall_image(self.axis, position, self.inward, grid, window, order)
         plane = plane_contact((wall,), (self.inward,), self.friction, around)

@@ -11,3 +11,4 @@ from mpmjax.cli._commands import (
 )
 from mpmjax.cli._scene_file import load_scene as load_scene
 from mpmjax.cli._scene_schema import scene_schema as scene_schema
+from mpmjax.cli._scene_writer import save_scene as save_scene

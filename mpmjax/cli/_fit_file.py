@@ -1,7 +1,6 @@
 """The `[fit]` table of a scene file: what is fitted, and what was measured. `docs/scene_files.md` is the schema in
 words."""
 
-import difflib
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import partial
@@ -17,21 +16,16 @@ from mpmjax.checks import require, require_positive, shortened
 from mpmjax.cli._measurements import observation
 from mpmjax.cli._scene_file import Simulation, read_simulation
 from mpmjax.fitting import (
-    LBFGS,
     AbstractOptimiser,
     AbstractParameter,
-    Adam,
     Bounded,
     Experiment,
     Gaussian,
-    LevenbergMarquardt,
     Positive,
     Starts,
     Unbounded,
 )
-from mpmjax.io import arguments, decode
-
-OPTIMISERS: dict[str, type[AbstractOptimiser]] = {cls.__name__: cls for cls in (LevenbergMarquardt, LBFGS, Adam)}
+from mpmjax.io import arguments, decode, require_keys
 
 
 class FitFile(NamedTuple):
@@ -66,20 +60,19 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
     table = _fit_table(path, simulation)
     sources = [(path, simulation, table)] if "observation" in table else []
     try:
-        _require_keys(table, "[fit]", _KEYS)
+        require_keys(table, _KEYS, "[fit]")
         for named_scene in _tables(table, "experiment"):
-            _require_keys(named_scene, "[[fit.experiment]]", {"scene"})
+            require_keys(named_scene, ("scene",), "[[fit.experiment]]")
             scene = named_scene.get("scene")
             require(isinstance(scene, str), "[[fit.experiment]] needs the key 'scene', a string.")
             file = path.parent / str(scene)
             other = read(file)
             sources.append((file, other, _fit_table(file, other)))
-            _require_keys(sources[-1][2], f"[fit] of {file}", _KEYS)
+            require_keys(sources[-1][2], _KEYS, f"[fit] of {file}")
         require(len(sources) > 0, "[fit] needs an [[fit.observation]], or an [[fit.experiment]] whose scene has one.")
         parts = [_experiments(*source) for source in sources]
         chosen = {key: value for key, value in table.items() if key in _SETTINGS}
         settings = fit_settings(**arguments(fit_settings, chosen, "[fit]"))
-        settings["optimiser"] = _optimiser(table["optimiser"]) if "optimiser" in table else None
         tables = _tables(table, "parameter")
         require(len(tables) > 0, "[fit] needs a [[fit.parameter]].")
         first = [fitted for fitted, _ in parts]
@@ -107,15 +100,8 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
 
 
 _TABLES = ("parameter", "observation", "experiment", "report")
-_SETTINGS = ("level", "starts", "fraction", "horizons", "refine", "discretisation")
-_KEYS = {*_TABLES, *_SETTINGS, "t1", "optimiser"}
-
-
-def _require_keys(table: dict[str, Any], where: str, keys: set[str]) -> None:
-    for key in table:
-        close = difflib.get_close_matches(key[:60], keys, 1)
-        hint = f", did you mean {close[0]!r}?" if close else "."
-        require(key in keys, f"{where} has the unknown key {key[:60]!r}{hint} Known are {', '.join(sorted(keys))}.")
+_SETTINGS = ("level", "starts", "fraction", "horizons", "refine", "discretisation", "optimiser")
+_KEYS = ("t1", *_SETTINGS, *_TABLES)
 
 
 def fit_settings(
@@ -126,8 +112,9 @@ def fit_settings(
     horizons: tuple[float, ...] | bool = False,
     refine: int | tuple[int, ...] = (),
     discretisation: bool | Literal["auto"] = "auto",
+    optimiser: AbstractOptimiser | None = None,
 ) -> dict[str, Any]:
-    """Level, starts, horizons, refinements and discretisation of a [fit] table."""
+    """How to fit, of a [fit] table."""
     require(0 < level < 1, f"[fit] level must lie between 0 and 1, got {level!r}.")
     many = starts != "auto" and starts > 1
     require(starts == "auto" or starts > 0, f"[fit] starts must be one at least, got {starts}.")
@@ -138,7 +125,7 @@ def fit_settings(
     finer = refinements(refine if isinstance(refine, tuple) else (refine,), "[fit] refine")
     places = starts if starts == "auto" else Starts(starts, float(fraction))
     sequence = {"starts": places, "horizons": horizons, "refine": finer}
-    return sequence | {"level": float(level), "discretisation": discretisation}
+    return sequence | {"level": float(level), "discretisation": discretisation, "optimiser": optimiser}
 
 
 def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:
@@ -147,18 +134,6 @@ def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:
     grow = all(a < b for a, b in zip((1, *finer), finer, strict=False))
     require(grow, f"{where} must be growing whole numbers of two at least, such as 2, got {list(numbers)}.")
     return (1, *finer) if finer else ()
-
-
-def _optimiser(data: Any) -> AbstractOptimiser:
-    table, where = {"kind": data} if isinstance(data, str) else data, "[fit.optimiser]"
-    kind = table.get("kind") if isinstance(table, dict) else None
-    there, kinds = isinstance(kind, str) and kind in OPTIMISERS, ", ".join(OPTIMISERS)
-    require(there, f"[fit] optimiser must have a kind, one of {kinds}, got {shortened(repr(data))}.")
-    cls = OPTIMISERS[str(kind)]
-    try:
-        return cls(**arguments(cls, {key: value for key, value in table.items() if key != "kind"}, where))
-    except ValueError as error:
-        raise ValueError(str(error) if str(error).startswith(where) else f"{where}: {error}") from None
 
 
 def _refined(simulation: Simulation, n: int) -> Simulation:

@@ -14,9 +14,9 @@ import numpy as np
 
 from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
-from mpmjax.checks import checked, require, require_positive, shortened, warn
+from mpmjax.checks import canonical, checked, require, require_positive, shortened, warn
 from mpmjax.geometry import AbstractRegion
-from mpmjax.io import arguments, check_fields, decode, save
+from mpmjax.io import arguments, check_fields, decode, load, save
 from mpmjax.simulation import number_of_steps
 from mpmjax.state import Particles, Scene, attach, fill, join, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
@@ -109,7 +109,7 @@ def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
     table = scene_table(path, changes)
     fit_table = table.pop("fit", None)
     require(fit_table is None or isinstance(fit_table, dict), f"{path}: [fit] must be a table.")
-    _find_meshes(table, path.parent)
+    _find_files(table, path.parent)
     groups, run_table, output_table = table.pop("particles"), table.pop("run"), table.pop("output", {})
     groups = groups if isinstance(groups, list) else [groups]
     try:
@@ -126,7 +126,13 @@ def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
 
         def build(n: int) -> tuple[Scene, Particles]:
             scene = decode(_refined(table, n), Scene)
-            particles = _filled(scene, groups, run.precision)
+            if any(isinstance(group, dict) and "file" in group for group in groups):
+                require(len(groups) == 1, "[particles] file has all particles of a scene: make it the only table.")
+                require(n == 1, "[particles] file: particles from a file cannot be refined, give them a region.")
+                particles = particles_in(**arguments(particles_in, groups[0], "[particles]"))
+                particles = canonical(particles, run.precision or particles.x.dtype)
+            else:
+                particles = _filled(scene, groups, run.precision)
             scene = attach(scene, particles)
             return scene, prepare(scene, particles)
 
@@ -194,11 +200,17 @@ def stable_step(path: Path, file: SceneFile) -> float:
         raise ValueError(f'{path}: [run] dt = "stable": {error}') from None
 
 
-def _find_meshes(table: Any, folder: Path) -> None:
-    """Names of meshes, which are relative to the scene file, as paths."""
+def particles_in(file: str, frame: int = -1) -> Particles:
+    """The particles of a frame in a run's file, with all of their state: frames count from 0, from the end if
+    negative."""
+    return load(file, frame=frame).final
+
+
+def _find_files(table: Any, folder: Path) -> None:
+    """Names of meshes and of particles' files, which are relative to the scene file, as paths."""
     for value in table.values() if isinstance(table, dict) else table if isinstance(table, list) else ():
-        _find_meshes(value, folder)
-    if isinstance(table, dict) and table.get("kind") == "Mesh" and isinstance(table.get("file"), str):
+        _find_files(value, folder)
+    if isinstance(table, dict) and isinstance(table.get("file"), str):
         table["file"] = str(folder / table["file"])
 
 

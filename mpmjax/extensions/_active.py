@@ -68,7 +68,6 @@ class Active(AbstractInelastic):
 
     def return_map(self, F: Deformation, history: Activation, dt: Scalar) -> tuple[Deformation, Activation]:
         """The deformation as it is."""
-        del dt
         return F, history
 
 

@@ -7,24 +7,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, ParticleScalar, ParticleVector, Point, Scalar, components
+from mpmjax._types import Array, Bool, Float, Point, Scalar, components
 from mpmjax.checks import coordinates, require, require_fields, require_positive, require_that
 from mpmjax.geometry import AbstractRegion, HalfSpace, Motion
 from mpmjax.state import Particles, Scene
 
 
-def placed(
-    scene: Scene,
-    particles: Particles,
-    chosen: Bool[Array, "p"],
-    *,
-    x: ParticleVector,
-    v: ParticleVector,
-    mass: ParticleScalar,
-    volume: ParticleScalar,
-) -> Particles:
-    """Prepared particles, of which the `chosen` ones are at x, move as one with v, have these masses and volumes, and
-    were never deformed."""
+def placed(scene: Scene, particles: Particles, chosen: Bool[Array, "p"], **new: Array) -> Particles:
+    """Prepared particles, of which the `chosen` ones have a `new` x, v, mass and volume, move as one, and were never
+    deformed."""
     require(not scene.total, "Particles enter and leave in the updated description only: drop TotalLagrangian().")
 
     def put(new: Any, old: Array, rows: slice = slice(None)) -> Array:
@@ -38,16 +29,9 @@ def placed(
         fresh = law.initial_history(components(rest))
         deformations.append(put(rest, old, rows))
         histories.append(jax.tree.map(lambda new, old, rows=rows: put(new, old, rows), fresh, group.history))
-    return replace(
-        particles,
-        x=put(x, particles.x),
-        v=put(v, particles.v),
-        C=None if particles.C is None else put(0, particles.C),
-        mass=put(mass, particles.mass),
-        volume=put(volume, particles.volume),
-        deformations=tuple(deformations),
-        histories=tuple(histories),
-    )
+    C = None if particles.C is None else put(0, particles.C)
+    rows = {name: put(values, getattr(particles, name)) for name, values in new.items()}
+    return replace(particles, C=C, deformations=tuple(deformations), histories=tuple(histories), **rows)
 
 
 class Inlet(eqx.Module):
@@ -100,9 +84,9 @@ class Inlet(eqx.Module):
                 *self.gate.normal,
             )
 
-    def _pushed(self, t: Scalar) -> tuple[ParticleVector, ParticleVector, Bool[Array, "q"], Bool[Array, "q"]]:
-        """Positions [m] and velocities [m/s] of the stock at time t, shape (q, d), what waits at the rear; whether each
-        has come into the nozzle, and whether it has left."""
+    def _pushed(self, t: Scalar) -> tuple[dict[str, Array], Bool[Array, "q"]]:
+        """x, v, mass and volume of the stock at time t, what waits at the rear without mass; and whether each has left
+        the nozzle."""
         start = jnp.asarray(self.stock.x)
         t = jnp.asarray(t, start.dtype)
 
@@ -115,17 +99,16 @@ class Inlet(eqx.Module):
         beyond, normal = self.gate.distance(x), jnp.asarray(self.gate.normal, x.dtype)
         behind = jnp.minimum(beyond + jnp.asarray(self.length, x.dtype), 0)
         rear = x - behind[:, None] * normal / jnp.linalg.norm(normal)
-        return rear, jnp.broadcast_to(v, x.shape), behind == 0, beyond > 0
+        mass, volume = (jnp.where(behind == 0, a, 0) for a in (self.stock.mass, self.stock.volume))
+        return {"x": rear, "v": jnp.broadcast_to(v, x.shape), "mass": mass, "volume": volume}, beyond > 0
 
     def entered(self, t: Scalar) -> Float[Array, ""]:
         """The mass that has come into the nozzle by time t [kg], from the start on."""
-        return jnp.where(self._pushed(t)[2], self.stock.mass, 0).sum()
+        return self._pushed(t)[0]["mass"].sum()
 
     def particles(self) -> Particles:
         """The stock as it stands at t = 0, to begin a run with, alone or joined to others."""
-        x, v, there, _ = self._pushed(0.0)
-        mass, volume = (jnp.where(there, a, 0) for a in (self.stock.mass, self.stock.volume))
-        return replace(self.stock, x=x, v=v, mass=mass, volume=volume)
+        return replace(self.stock, **self._pushed(0.0)[0])
 
     def __call__(
         self, scene: Scene, particles: Particles, t: Scalar, dt: Scalar, memory: Any
@@ -137,25 +120,11 @@ class Inlet(eqx.Module):
             f"An Inlet's stock of {self.stock.count} particles from number {self.first} on must be among the "
             f"{particles.count} of the run: join inlet.particles() to the others, and give its `first`.",
         )
-        x, v, there, free = self._pushed(t)
         rows = slice(self.first, self.first + self.stock.count)
-
-        def among(a: Array, part: Array) -> Array:
-            return a.at[rows].set(part)
-
-        return (
-            scene,
-            placed(
-                scene,
-                particles,
-                among(jnp.zeros(particles.count, bool), ~free),
-                x=among(particles.x, x),
-                v=among(particles.v, v),
-                mass=among(particles.mass, jnp.where(there, self.stock.mass, 0)),
-                volume=among(particles.volume, jnp.where(there, self.stock.volume, 0)),
-            ),
-            memory,
-        )
+        pushed, free = self._pushed(t)
+        new = {name: getattr(particles, name).at[rows].set(values) for name, values in pushed.items()}
+        held = jnp.zeros(particles.count, bool).at[rows].set(~free)
+        return scene, placed(scene, particles, held, **new), memory
 
 
 class Outlet(eqx.Module):

@@ -220,13 +220,9 @@ class RigidConstraint(AbstractConstraint):
         deformations[self.number] = R @ jnp.asarray(before.deformations[self.number])
         if C is not None:
             C = C.at[rows].set(spinning(spin, jnp.eye(before.dim, dtype=dtype)).T)
-        return replace(
-            after,
-            x=after.x.at[rows].set(body.centre + dt * over[0] + arms),
-            v=after.v.at[rows].set(end[0] + spinning(spin, arms)),
-            C=C,
-            deformations=tuple(deformations),
-        )
+        x = after.x.at[rows].set(body.centre + dt * over[0] + arms)
+        v = after.v.at[rows].set(end[0] + spinning(spin, arms))
+        return replace(after, x=x, v=v, C=C, deformations=tuple(deformations))
 
     def received(
         self,

@@ -227,12 +227,8 @@ class _Divergence(eqx.Module):
     def __call__(self, v: NodeVector) -> Float[Array, "a n"]:
         """B v, one row for each material with averaged volumes."""
         slopes = gather(self.stencil, self.mirror.unfold(self.projection.combine(v, 0)))[1]
-        return jnp.stack(
-            [
-                one.average.at_nodes(la.double_dot(one.volumetric, slopes[..., slice(*one.rows)]))
-                for one in self.averaged
-            ]
-        )
+        changes = [la.double_dot(one.volumetric, slopes[..., slice(*one.rows)]) for one in self.averaged]
+        return jnp.stack([one.average.at_nodes(change) for one, change in zip(self.averaged, changes, strict=True)])
 
     def transpose(self, q: Float[Array, "a n"]) -> NodeVector:
         """Bᵀ q."""

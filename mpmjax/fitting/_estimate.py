@@ -1,6 +1,7 @@
 """Estimates of numbers and of noise, and the shapes that residuals show where a model misses the data."""
 
 import abc
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,29 +9,17 @@ import numpy as np
 
 
 class Estimate(NamedTuple):
-    """A fitted number, or one that follows from those.
+    """A fitted number, or one that follows from those."""
 
-    Attributes:
-        label: the name of the parameter, with the index of an array.
-        value: the fitted value.
-        error: standard error, of the noise and of what the misfit shows (see `fit`).
-        interval: where it lies at the level of the fit.
-        unit: as the parameter says it.
-        start: the first guess.
-        at_bound: whether it came to lie at a bound, where errors mean little.
-        noise_error: standard error that the noise alone makes.
-        noise_interval: where it lies by the noise alone.
-    """
-
-    label: str
-    value: float
-    error: float
-    interval: tuple[float, float]
-    unit: str = ""
-    start: float = np.nan
-    at_bound: bool = False
-    noise_error: float = np.nan
-    noise_interval: tuple[float, float] = (np.nan, np.nan)
+    label: str  # the name of the parameter, with the index of an array
+    value: float  # the fitted value
+    error: float  # standard error, of the noise and of what the misfit shows (see `fit`)
+    interval: tuple[float, float]  # where it lies at the level of the fit
+    unit: str = ""  # as the parameter says it
+    start: float = np.nan  # the first guess
+    at_bound: bool = False  # whether it came to lie at a bound, where errors mean little
+    noise_error: float = np.nan  # standard error that the noise alone makes
+    noise_interval: tuple[float, float] = (np.nan, np.nan)  # where it lies by the noise alone
 
     @property
     def name(self) -> str:
@@ -42,29 +31,31 @@ class Estimate(NamedTuple):
         """Value with error, and interval, as a `table` has them."""
         return f"{self.value:>12.6g} ± {self.error:<9.2g}", f"{self.interval[0]:.5g} to {self.interval[1]:.5g}"
 
+    def row(self, widened: bool) -> tuple[str, ...]:
+        """All of it, as a `table` has it; the interval of the noise alone where others are `widened`."""
+        alone = [f"{self.noise_interval[0]:.5g} to {self.noise_interval[1]:.5g}"] if widened else []
+        start = "" if np.isnan(self.start) else f"{self.start:>10.4g}"
+        return self.name, *self.cells, *alone, start, "at its bound" if self.at_bound else ""
+
 
 class NoiseEstimate(NamedTuple):
-    """The noise of an observation.
+    """The noise of an observation."""
 
-    Attributes:
-        name: the name of the observation.
-        sigma: standard deviation, the root mean square where it varies, in the data's unit.
-        estimated: whether the fit estimated it.
-        misfit: root mean square of the residuals, in units of σ.
-        points: how many numbers were measured.
-        worth: how many independent numbers they are worth, by the correlation of their residuals.
-        shape: the shape of the residuals, "a ramp", "drifts" or "correlated"; empty where they have none.
-        is_beyond: whether the misfit is beyond the noise: by χ² where that is given, by the shape where it is not.
-    """
+    name: str  # the name of the observation
+    sigma: float  # standard deviation, the root mean square where it varies, in the data's unit
+    estimated: bool  # whether the fit estimated it
+    misfit: float  # root mean square of the residuals, in units of σ
+    points: int  # how many numbers were measured
+    worth: float  # how many independent numbers they are worth, by the correlation of their residuals
+    shape: str  # the shape of the residuals, "a ramp", "drifts" or "correlated"; empty where they have none
+    is_beyond: bool  # whether the misfit is beyond the noise: by χ² where that is given, by the shape where it is not
 
-    name: str
-    sigma: float
-    estimated: bool
-    misfit: float
-    points: int
-    worth: float
-    shape: str
-    is_beyond: bool
+    @property
+    def row(self) -> tuple[str, ...]:
+        """All of it, as a `table` has it."""
+        sigma = f"{self.sigma:.3g} {'estimated' if self.estimated else 'given'}"
+        shape = self.shape and f"{self.shape}: worth {self.worth:.2g} independent numbers"
+        return self.name, f"{self.points:>12}", sigma, f"{self.misfit:.3g}", shape
 
 
 class AbstractFit(eqx.Module):
@@ -89,6 +80,13 @@ class AbstractFit(eqx.Module):
         return estimates[label]
 
 
+def table(head: Sequence[str], *rows: Sequence[str]) -> list[str]:
+    """The lines of a table, its columns as wide as they need."""
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    widths[0] = max(widths[0], _FIRST_COLUMN)
+    return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]
+
+
 def improbable(squares: Any, freedom: float) -> bool:
     """Whether Σ r² of this many degrees of freedom is beyond noise of variance one."""
     from scipy.special import chdtrc  # here, since it takes long to import
@@ -96,15 +94,9 @@ def improbable(squares: Any, freedom: float) -> bool:
     return bool(freedom > 0 and chdtrc(freedom, squares) < IMPROBABLE)
 
 
-class Shape(NamedTuple):
-    """The shape of an observation's residuals."""
-
-    factor: float  # numbers measured, over how many independent ones they are worth, one at least
-    kind: str  # "a ramp", "drifts" or "correlated"; empty where they look like independent noise
-
-
-def shape_of(r: np.ndarray) -> Shape:
-    """The shape of residuals (f, ...): sequences of f in the order of time, or of another abscissa.
+def shape_of(r: np.ndarray) -> tuple[float, str]:
+    """The shape of residuals (f, ...), sequences of f in the order of time, or of another abscissa: numbers measured,
+    over how many independent ones they are worth, one at least; and "a ramp", "drifts", "correlated", or "" of noise.
 
     Numbers with correlation ρ_k at a distance k are worth N/τ independent ones (G. V. Bayley, J. M. Hammersley, Suppl.
     J. R. Stat. Soc. 8 (1946) 184, doi 10.2307/2983560), τ being the larger of 1 + 2 Σ ρ_k, which counts for means, as
@@ -116,7 +108,7 @@ def shape_of(r: np.ndarray) -> Shape:
     rows = rows[:, (rows != 0).any(axis=0)]
     count, columns = rows.shape
     if count < _LEAST_ROWS or columns == 0:
-        return Shape(1.0, "")
+        return 1.0, ""
     alike, of_means, of_squares = _correlation(rows)
     t = np.linspace(-1, 1, count)
     left = rows - np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyfit(t, rows, 1)).T
@@ -125,7 +117,7 @@ def shape_of(r: np.ndarray) -> Shape:
     steep = improbable(squares.sum() / alike / max(_correlation(left)[1:]), columns / alike)
     kind = "correlated" if max(alike, of_means, of_squares) > 1 else ""
     kind = "a ramp" if steep and explained > rest.sum() else "drifts" if of_means > count / _DRIFT else kind
-    return Shape(alike * max(of_means, of_squares), kind)
+    return alike * max(of_means, of_squares), kind
 
 
 def _correlation(rows: np.ndarray) -> tuple[float, float, float]:
@@ -161,4 +153,6 @@ def _correlation(rows: np.ndarray) -> tuple[float, float, float]:
 IMPROBABLE = 1e-3
 """Probability, of noise alone, below which a misfit is beyond the noise, or residuals have a shape."""
 _LEAST_ROWS = 8  # rows below which nothing is said of their order
+VALUE = f"{{:>12}} ± {'error':<9}"  # head of the first of `Estimate.cells`
+_FIRST_COLUMN = 24
 _DRIFT = 6  # independent numbers along a sequence, up to which it drifts

@@ -16,11 +16,12 @@ import numpy as np
 from mpmjax._types import Scalar
 from mpmjax.checks import checked, require, warn
 from mpmjax.fitting._discretisation import changes_on_coarse_grid
+from mpmjax.fitting._estimate import table
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._log import recorded
 from mpmjax.fitting._optimiser import LBFGS, LevenbergMarquardt
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem, Sigmas, table
+from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._result import FitResult, Noise, fit_result, settle_noise
 from mpmjax.fitting._search import (
     NO_DERIVATIVE,
@@ -70,12 +71,9 @@ def fit(
 
     The misfit is held against the noise, and residuals of each observation, in their order, against independent ones:
     where there is more than that, other starts are tried (`starts`), the table says what shape residuals have, and
-    errors and intervals hold it. The covariance is (JᵀJ)⁻¹ Σ c_k J_kᵀJ_k (JᵀJ)⁻¹, c_k being the product of χ²/ν of
-    observation k, where its noise was given and that is improbable (R. T. Birge, Phys. Rev. 40 (1932) 207,
-    doi 10.1103/PhysRev.40.207), and of its numbers over the independent ones that they are worth, N/N' (see
-    `NoiseEstimate.worth`); with Student's quantile of ν N'/N, or four, degrees of freedom. Those of the noise alone, by
-    (JᵀJ)⁻¹, stand beside them. None of it sees what a parameter can make up for: for that they hold how far the minimum
-    moves on twice the spacing (`discretisation`).
+    errors and intervals hold it, those of the noise alone beside them: by the covariance (JᵀJ)⁻¹ Σ c_k J_kᵀJ_k (JᵀJ)⁻¹
+    with a factor c_k for each observation (docs/fitting.md#intervals-that-hold says how it comes about), and Student's
+    quantile. None of it sees what a parameter can make up for: for that see `discretisation`.
 
     Ctrl-C ends a fit after the iteration in progress, and it returns the best that it has, not converged.
 
@@ -86,10 +84,9 @@ def fit(
             is beyond the noise, 24 more points are looked at, a simulation each, and some searched from, until a misfit
             is within it; `result.screening` has what they found. 1 searches from the first guess alone.
         discretisation: whether to look at twice the spacing, and at twice the step there, by three runs each at most,
-            and count as errors how far the minimum moves: what the grid convergence index makes of two grids (P. J.
-            Roache, J. Fluids Eng. 116 (1994) 405, doi 10.1115/1.2910291). "auto": where the misfit is beyond the noise,
-            or residuals have a shape. What parameters wholly make up for leaves neither: take True for a number that
-            is to be published.
+            and count as errors how far the minimum moves, as the grid convergence index does. "auto": where the misfit
+            is beyond the noise, or residuals have a shape. What parameters wholly make up for leaves neither: take True
+            for a number that is to be published.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
         optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, with few
@@ -134,17 +131,18 @@ def fit(
 
         descend = partial(_in_rounds, [problem], optimiser=optimiser, begun=begun, report=record)
 
-        def resulted(end: Search, settled: Noise) -> FitResult:
-            return fit_result(problem, optimiser, end, settled, report, level)
+        def resulted(end: Search, settled: Noise | None) -> FitResult | None:
+            return None if settled is None else fit_result(problem, optimiser, end, settled, report, level)
 
         def enough(end: Search) -> bool:
             """Whether a search is at a minimum that the noise explains."""
             if end.failure or not end.converged or end.joined is not None or not starts.if_needed:
                 return False
-            return not resulted(end, settle_noise(problem, end, noise)[0]).is_beyond
+            result = resulted(end, settle_noise(problem, end, noise)[0])
+            return result is not None and not result.is_beyond
 
         ((end, settled, changing, noise),) = descend([sigmas], starts={0: zeros}, rounds=first, state=state)
-        result = None if settled is None else resulted(end, settled)
+        result = resulted(end, settled)
         history = (*earlier, *end.history)
         # The log of a fit that other starts have brought farther holds a search that begins where none ended.
         brought = any(b.number == 0 and not np.array_equal(a.z, b.z) for a, b in pairwise(history))
@@ -155,12 +153,10 @@ def fit(
             best, screening = look_around(problem, optimiser, starts, end, noise, enough, progress)
             if best is not None:
                 ((end, settled, changing, _),) = descend([problem.first_sigmas], starts={0: best.z})
-                result = None if settled is None else resulted(end, settled)
+                result = resulted(end, settled)
                 history = (*history, *end.history)
     if result is None:
-        if end.interrupted:
-            raise KeyboardInterrupt
-        require_derivative(end)
+        require_end(end)
         tried = "" if screening is None else f"No search of {len(screening.searched)} came to a minimum: {end.failure}."
         problem.explain(zeros, *([tried] if tried else []))
     looks = any(n.is_beyond or n.shape for n in result.noise) if discretisation == "auto" else discretisation
@@ -225,8 +221,11 @@ def _in_rounds(
     return [outcomes[k] for k in range(len(problems))]
 
 
-def require_derivative(end: Search) -> None:
-    """Raise a `RuntimeError` if a search failed for want of a derivative."""
+def require_end(end: Search) -> None:
+    """Raise a `KeyboardInterrupt` if a search was interrupted, a `RuntimeError` if it failed for want of a
+    derivative."""
+    if end.interrupted:
+        raise KeyboardInterrupt
     if end.failure == NO_DERIVATIVE:
         raise RuntimeError(
             "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the "
@@ -271,15 +270,16 @@ class EnsembleFit(eqx.Module):
     @property
     def values(self) -> dict[str, np.ndarray]:
         """The estimates of each parameter, NaN where the fit failed, shape (k, ...)."""
+        each = [None if fit is None else fit.values for fit in self.fits]
         lost = {name: np.full(value.shape, np.nan) for name, value in self._done[0].values.items()}
-        each = [lost if fit is None else fit.values for fit in self.fits]
-        return {name: np.stack([values[name] for values in each]) for name in lost}
+        return {name: np.stack([(values or lost)[name] for values in each]) for name in lost}
 
     @property
     def errors(self) -> np.ndarray:
         """The standard error of each estimate of the n numbers, NaN where the fit failed, shape (k, n)."""
-        lost = [np.nan] * len(self._done[0].estimates)
-        return np.array([lost if fit is None else [e.error for e in fit.estimates] for fit in self.fits])
+        errors = np.full((len(self.fits), len(self._done[0].estimates)), np.nan)
+        errors[[fit is not None for fit in self.fits]] = self._columns[1]
+        return errors
 
     @property
     def alike(self) -> np.ndarray:
@@ -299,28 +299,24 @@ class EnsembleFit(eqx.Module):
 
     @property
     def _done(self) -> list[FitResult]:
+        """The fits that did not fail."""
         return [fit for fit in self.fits if fit is not None]
 
     @property
     def _columns(self) -> tuple[np.ndarray, ...]:
         """Values, errors, and whether they lie at a bound, each of shape (fits that did not fail, n)."""
-        rows = [fit.estimates for fit in self._done]
-        return tuple(np.array([[getattr(e, f) for e in row] for row in rows]) for f in ("value", "error", "at_bound"))
+        fields = "value", "error", "at_bound"
+        return tuple(np.array([[getattr(e, f) for e in fit.estimates] for fit in self._done]) for f in fields)
 
     def __str__(self) -> str:
         """A table: the mean and spread of each number over the data sets, and the errors of the fits."""
         (values, errors, held), alike = self._columns, self.alike
         spread = values.std(axis=0, ddof=1) if len(values) > 1 else np.full(values.shape[1], np.nan)
-        rows = [
-            (
-                e.name,
-                f"{values[:, k].mean():>12.6g}",
-                f"{spread[k]:>10.2g}",
-                f"{np.sqrt((errors[:, k] ** 2).mean()):>13.2g}",
-                f"p = {alike[k]:.2g}" + (f", {held[:, k].sum()} at the bound" if held[:, k].any() else ""),
-            )
-            for k, e in enumerate(self._done[0].estimates)
-        ]
+        mean, error, rows = values.mean(axis=0), np.sqrt((errors**2).mean(axis=0)), []
+        for k, e in enumerate(self._done[0].estimates):
+            at_bound = f", {held[:, k].sum()} at the bound" if held[:, k].any() else ""
+            numbers = f"{mean[k]:>12.6g}", f"{spread[k]:>10.2g}", f"{error[k]:>13.2g}"
+            rows.append((e.name, *numbers, f"p = {alike[k]:.2g}{at_bound}"))
         head = "", f"{'mean':>12}", f"{'spread':>10}", "error of one", "same value?"
         last = f"{len(values)} data sets" + (f", {len(self.failures)} failed" if self.failures else "")
         return "\n".join([*table(head, *rows), last])
@@ -358,13 +354,11 @@ def fit_ensemble(
     """
     require(len(experiments) > 0, "An ensemble needs a data set at least.")
     level = checked_level(level)
-    sets = [
-        (e,) if isinstance(e, Experiment) else tuple(e) if isinstance(e, (tuple, list)) else () for e in experiments
-    ]
-    for k, each in enumerate(sets):
-        usable = len(each) > 0 and all(isinstance(e, Experiment) for e in each)
-        require(usable, f"Data set {k} must be an Experiment, or a tuple of some, got {type(experiments[k]).__name__}.")
-    problems = [FitProblem(each, parameters) for each in sets]
+    for k, e in enumerate(experiments):
+        each = e if isinstance(e, (tuple, list)) else (e,)
+        usable = len(each) > 0 and all(isinstance(part, Experiment) for part in each)
+        require(usable, f"Data set {k} must be an Experiment, or a tuple of some, got {type(e).__name__}.")
+    problems = [FitProblem(e, parameters) for e in experiments]
     optimiser = chosen_optimiser(problems[0]) if optimiser is None else optimiser
     size = batch_size(problems[0], batch, len(problems))
     zeros = {k: jnp.zeros(p.size, p.dtype) for k, p in enumerate(problems)}

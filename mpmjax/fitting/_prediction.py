@@ -11,10 +11,10 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
-from mpmjax.fitting._estimate import AbstractFit, Estimate
+from mpmjax.fitting._estimate import VALUE, AbstractFit, Estimate, table
 from mpmjax.fitting._experiment import Experiment, Numbers
 from mpmjax.fitting._fit import checked_level
-from mpmjax.fitting._problem import Coordinates, FitProblem, linearised, table
+from mpmjax.fitting._problem import Coordinates, FitProblem, linearised
 from mpmjax.fitting._result import FitResult
 from mpmjax.fitting._search import AbstractOptimiser, batch_size, counted, search_many
 from mpmjax.fitting._uncertainty import Prediction, banded
@@ -38,9 +38,8 @@ def predict(
         mpm.fitting.predict(result, height)
 
     The error is by the delta method: √(g·C g) of each number, g its derivative by the search's coordinates (forward
-    mode) and C their covariance. The band reaches as many errors to each side as a normal distribution, or Student's
-    where the noise was estimated, says. It holds as far as the quantity is linear in the coordinates over their errors:
-    where a parameter's profile is far from symmetric the band is approximate too.
+    mode) and C their covariance; the band is normal, or Student's where the noise was estimated. It holds as far as the
+    quantity is linear in the coordinates over their errors, which a parameter's profile shows.
 
     Args:
         result: the fit.
@@ -170,7 +169,7 @@ class Bootstrap(AbstractFit):
 
     def __str__(self) -> str:
         """A table."""
-        head = "", f"{'value':>12} ± {'error':<9}", f"{100 * self.level:g} % interval"
+        head = "", VALUE.format("value"), f"{100 * self.level:g} % interval"
         last = f"{len(self.samples)} fits of data drawn anew" + (f", {self.failed} failed" if self.failed else "")
         return "\n".join([*table(head, *((e.name, *e.cells) for e in self.estimates)), last])
 
@@ -189,9 +188,9 @@ def bootstrap(
     fit's σ, fitted again, many times (the parametric bootstrap: B. Efron, R. J. Tibshirani, An Introduction to the
     Bootstrap, Chapman & Hall 1993, chapters 6.5 and 13).
 
-    It takes the model and the independence of the noise for granted, as the errors of `fit` do, and adds the curvature
-    of the model and what bounds do. `weight` and `robust` act in each fit; the noise drawn is of σ for each number. A
-    prior's mean is drawn anew too. 200 repeats fix a standard error to 5 %, a 95 % interval less well.
+    It takes the model and independent noise for granted, and adds the curvature of the model and what bounds do.
+    `weight` and `robust` act in each fit; a prior's mean is drawn anew too. 200 repeats fix a standard error to 5 %, a
+    95 % interval less well.
 
     Args:
         result: the fit.

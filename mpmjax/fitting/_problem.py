@@ -30,6 +30,7 @@ class FitProblem(eqx.Module):
     parameters: tuple[AbstractParameter, ...]  # what is searched
     starts: tuple[Array, ...]  # the first guess of each
     memory: int = eqx.field(static=True, default=2**28)  # memory for what reverse mode stores, and for tangents [B]
+    plane: tuple[Float[Array, "n"], Float[Array, "n f"]] | None = None  # see `on_plane`
 
     def __init__(
         self,
@@ -37,7 +38,7 @@ class FitProblem(eqx.Module):
         parameters: Mapping[str, AbstractParameter],
         memory: int = 2**28,
     ):
-        self.memory = require_whole("memory [B]", memory, 1)
+        self.memory, self.plane = require_whole("memory [B]", memory, 1), None
         experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
         require(len(experiments) > 0, "A fit needs an experiment at least.")
         require(len(parameters) > 0, "A fit needs a parameter at least.")
@@ -81,10 +82,16 @@ class FitProblem(eqx.Module):
             parameter.check_experiment(name, self.experiments[k])
         return jnp.asarray(start)
 
+    def on_plane(self, origin: np.ndarray, basis: np.ndarray) -> "FitProblem":
+        """The problem on a plane of its coordinates, origin + basis y, shapes (n,) and (n, f), as a function of y: one
+        program for all planes of as many dimensions, spanned by some of the coordinates."""
+        plane = jnp.asarray(origin, self.dtype), jnp.asarray(basis, self.dtype)
+        return eqx.tree_at(lambda p: p.plane, self, plane, is_leaf=lambda leaf: leaf is None)
+
     @property
     def size(self) -> int:
         """Number of coordinates n."""
-        return sum(start.size for start in self.starts)
+        return sum(start.size for start in self.starts) if self.plane is None else self.plane[1].shape[1]
 
     @property
     def dtype(self) -> Any:
@@ -159,13 +166,13 @@ class FitProblem(eqx.Module):
         """Root mean square of the residuals of the measured numbers, in units of σ, or of the size of the data."""
         return float(np.sqrt(2 * cost / self.points))
 
-    def unrestricted(self, z: Float[Array, "f"]) -> Float[Array, "n"]:
-        """The coordinates of all parameters, where a profile holds one."""
-        return z
+    def _valued(self, z: Coordinates) -> tuple[tuple[Array, ...], Float[Array, "n"], Float[Array, "2 n"]]:
+        """See `_valued`, on the problem's plane."""
+        return _valued(self.parameters, self.starts, z if self.plane is None else self.plane[0] + self.plane[1] @ z)
 
     def values(self, z: Coordinates) -> tuple[Array, ...]:
         """The value of each parameter."""
-        return _valued(self.parameters, self.starts, self.unrestricted(z))[0]
+        return self._valued(z)[0]
 
     def by_name(self, z: Coordinates) -> dict[str, np.ndarray]:
         """The value of each parameter by its name, in its shape."""
@@ -173,7 +180,7 @@ class FitProblem(eqx.Module):
 
     def numbers(self, z: Coordinates) -> Float[Array, "n"]:
         """The values of all parameters, one after the other."""
-        return _valued(self.parameters, self.starts, self.unrestricted(z))[1]
+        return self._valued(z)[1]
 
     def shown(self, z: np.ndarray | Coordinates) -> str:
         """The first values with their labels, in a line."""
@@ -183,7 +190,8 @@ class FitProblem(eqx.Module):
 
     def room(self, z: Coordinates) -> Float[Array, "2 n"]:
         """How far each value can fall and rise until its bounds, over its derivative by the coordinate [-]."""
-        return _valued(self.parameters, self.starts, self.unrestricted(z))[2]
+        room = self._valued(z)[2]
+        return room if self.plane is None else jnp.where(self.plane[1].T != 0, room[:, None], jnp.inf).min(axis=2)
 
     def at(self, z: Coordinates) -> tuple[Experiment, ...]:
         """The experiments with these values."""
@@ -324,15 +332,7 @@ def in_batches(function: Callable[[Any], tuple[Any, Any]], units: Any, at_once: 
     return jax.tree.map(lambda a: a[0], once), jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], each)
 
 
-def table(head: Sequence[str], *rows: Sequence[str]) -> list[str]:
-    """The lines of a table, its columns as wide as they need."""
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-    widths[0] = max(widths[0], _FIRST_COLUMN)
-    return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]
-
-
 SHOWN = 4  # parameters that a line has room for
 ROW_COST = 1.2
 """Cost of a row of the Jacobian by reverse mode, over that of a column by forward mode (benchmarks/fit_cost.py)."""
 _COPIES = 16  # memory that a tangent takes, in sizes of the particles' (benchmarks/fit_cost.py)
-_FIRST_COLUMN = 24

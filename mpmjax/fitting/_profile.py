@@ -1,17 +1,15 @@
 """Profile likelihoods: intervals that need no straight line."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Scalar
+from mpmjax._types import Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
 from mpmjax.fitting._evaluation import costs_at
 from mpmjax.fitting._fit import checked_level
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._result import FitResult, intervals
 from mpmjax.fitting._search import AbstractOptimiser, search
 from mpmjax.fitting._uncertainty import quantile
@@ -21,36 +19,22 @@ class Profile(eqx.Module):
     """How the misfit grows when one parameter is held at other values and all others are fitted anew.
 
     `print(profile)` says its interval.
-
-    Attributes:
-        label: the parameter.
-        unit: the unit of the parameter.
-        values: values of the parameter, growing, shape (p,); the fit's is among them.
-        statistic: Δχ² = Σ r² there less that of the fit, in units of the noise, shape (p,).
-        numbers: all fitted numbers along it, one a column in the order of `labels`, shape (p, n).
-        labels: names of the fitted numbers.
-        estimate: the value of the fit.
-        symmetric: the interval of the standard error.
-        interval: where Δχ² is below the threshold. An end that was not found is the parameter's bound, or infinite.
-        threshold: Δχ² at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν), or more.
-        degrees_of_freedom: ν of the noise's estimate; infinite where it was given.
-        level: the level of the interval [-], such as 0.95.
-        warnings: where it ends without an end of the interval, in words.
     """
 
-    label: str
-    unit: str
-    values: np.ndarray
-    statistic: np.ndarray
-    numbers: np.ndarray
-    labels: tuple[str, ...]
-    estimate: float
-    symmetric: tuple[float, float]
+    label: str  # the parameter
+    unit: str  # the unit of the parameter
+    values: np.ndarray  # values of the parameter, growing, shape (p,); the fit's is among them
+    statistic: np.ndarray  # Δχ² = Σ r² there less that of the fit, in units of the noise, shape (p,)
+    numbers: np.ndarray  # all fitted numbers along it, one a column in the order of `labels`, shape (p, n)
+    labels: tuple[str, ...]  # names of the fitted numbers
+    estimate: float  # the value of the fit
+    symmetric: tuple[float, float]  # the interval of the standard error
     interval: tuple[float, float]
-    threshold: float
-    degrees_of_freedom: float
-    level: float
-    warnings: tuple[str, ...]
+    """Where Δχ² is below the threshold. An end that was not found is the parameter's bound, or infinite."""
+    threshold: float  # Δχ² at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν), or more
+    degrees_of_freedom: float  # ν of the noise's estimate; infinite where it was given
+    level: float  # the level of the interval [-], such as 0.95
+    warnings: tuple[str, ...]  # where it ends without an end of the interval, in words
 
     @property
     def signed_root(self) -> np.ndarray:
@@ -98,11 +82,9 @@ def profile(
     neither symmetric nor finite. In a linear problem both are one.
 
     From the estimate it goes to either side in steps of equal growth of √Δχ². Where the threshold is never reached the
-    interval is open, and where Δχ² jumps over it, as a simulation does beyond its stable step, it ends there: a warning
-    says so. One program is compiled for all points, and for all numbers of a fit.
-
-    The noise is held at what the fit found. Where the fit's misfit is beyond it, the threshold is larger by the square
-    of what errors are (see `fit`). With a robust or weighted observation it is approximate.
+    interval is open, and where Δχ² jumps over it, as beyond a stable step, it ends there: a warning says so. The noise
+    is the fit's; where the misfit is beyond it, the threshold is larger by the square of what errors are. With a robust
+    or weighted observation it is approximate. One program is compiled for all numbers of a fit.
 
     Args:
         result: the fit.
@@ -139,6 +121,10 @@ def profile(
     def misfit(z: np.ndarray) -> float:
         return 2 * float(costs_at(problem, z[None], sigmas, 1)[0])
 
+    def say(text: str) -> None:
+        texts.append(f"{label}: {text}")
+        warn(texts[-1])
+
     start: _Point = np.asarray(result.z, float), 0.0
     least, visited, unsettled, texts = misfit(start[0]), [start], 0, list[str]()
     # How the other coordinates follow this one when it is moved, by the covariance.
@@ -160,8 +146,8 @@ def profile(
             square = misfit(z)
         else:
             basis = np.delete(np.eye(len(z)), at, axis=1)
-            held = _RestrictedProblem(problem, jnp.asarray(z, dtype), jnp.asarray(basis, dtype))
-            end = search(held, optimiser, jnp.zeros(basis.shape[1], dtype), sigmas)
+            held = problem.on_plane(z, basis)
+            end = search(held, optimiser, jnp.zeros(held.size, dtype), sigmas)
             if end.interrupted:
                 raise KeyboardInterrupt
             if end.failure:
@@ -189,17 +175,16 @@ def profile(
             return reach if point is None else _root(point) - reach
 
         within = float(rtol) / 2 * abs(above[0][at] - start[0][at])
-        root = root_scalar(excess, method="brentq", bracket=(below[0][at], above[0][at]), xtol=within).root
-        apart = {place: excess(place) for place in tried}
-        inner = min((p for p in apart if apart[p] < 0), key=lambda p: abs(p - root))
-        outer = min((p for p in apart if apart[p] >= 0), key=lambda p: abs(p - root))
+        root = float(root_scalar(excess, method="brentq", bracket=(below[0][at], above[0][at]), xtol=within).root)
+        sides = ([p for p in tried if (excess(p) < 0) == inside] for inside in (True, False))
+        inner, outer = (min(side, key=lambda p: abs(p - root)) for side in sides)
         last, beyond = tried[inner], tried[outer]
         assert last is not None
-        if apart[outer] - apart[inner] < _JUMP * reach or abs(outer - inner) > 4 * within:
-            return float(root), last, None, None
+        if excess(outer) - excess(inner) < _JUMP * reach or abs(outer - inner) > 4 * within:
+            return root, last, None, None
         if beyond is None:
             return float(np.copysign(np.inf, outer - inner)), last, float(outer), None
-        return float(root), last, None, beyond[1]
+        return root, last, None, beyond[1]
 
     def end(side: int) -> tuple[float, _Point, float | None, float | None]:
         """Walk to one side until √Δχ² is beyond `reach`: the coordinate where it crosses, infinite if it does not; the
@@ -230,27 +215,25 @@ def profile(
     ends = [end(side) for side in (-1, 1)]
     for (place, (z, growth), fault, jump), where in zip(ends, ("below", "above"), strict=True):
         if jump is not None:
-            texts.append(
-                f"{label}: the interval ends {where} at {numbers(z)[at]:.5g}, where Δχ² jumps from "
-                f"{max(growth, 0):.2g} to {jump:.2g}: the simulation changes abruptly there, and not the data end it. "
-                "See whether its step is stable."
+            say(
+                f"the interval ends {where} at {numbers(z)[at]:.5g}, where Δχ² jumps from {max(growth, 0):.2g} to "
+                f"{jump:.2g}: the simulation changes abruptly there, and not the data end it. See whether its step is "
+                "stable."
             )
         if np.isinf(place):
             beyond = "" if fault is None else f" Beyond, at {value(fault):.5g}, the simulation fails."
-            texts.append(
-                f"{label}: the interval is open {where}. At {numbers(z)[at]:.5g} Δχ² is {max(growth, 0):.2g}, less "
-                f"than {reach**2:.3g}: the data do not bound it.{beyond}"
+            say(
+                f"the interval is open {where}. At {numbers(z)[at]:.5g} Δχ² is {max(growth, 0):.2g}, less than "
+                f"{reach**2:.3g}: the data do not bound it.{beyond}"
             )
     z, growth = min(visited, key=lambda point: point[1])
     if growth < -_BETTER:
-        texts.append(
-            f"{label}: the profile found a misfit smaller by {-growth:.2g} at {numbers(z)[at]:.5g}: the fit is not at "
-            "the least one. Fit again from there."
+        say(
+            f"the profile found a misfit smaller by {-growth:.2g} at {numbers(z)[at]:.5g}: the fit is not at the least "
+            "one. Fit again from there."
         )
     if unsettled:
-        texts.append(f"{label}: at {unsettled} points of the profile the others did not converge.")
-    for text in texts:
-        warn(text)
+        say(f"at {unsettled} points of the profile the others did not converge.")
     path = sorted(visited, key=lambda point: point[0][at])
     along_path, values = np.stack([numbers(z) for z, _ in path]), [value(place) for place, *_ in ends]
     pull = result.jacobian.T @ result.residuals * np.array([e.at_bound for e in result.estimates])
@@ -278,38 +261,6 @@ _Point = tuple[np.ndarray, float]  # all coordinates where one is held, the othe
 def _root(point: _Point) -> float:
     """√Δχ²; negative where the misfit is less than that of the fit."""
     return float(np.sign(point[1]) * np.sqrt(abs(point[1])))
-
-
-class _RestrictedProblem(FitProblem):
-    """A problem on a plane of its coordinates, z = origin + basis y, as a function of y: one program for all planes of
-    as many dimensions."""
-
-    whole: FitProblem = eqx.field(kw_only=True)
-    origin: Coordinates = eqx.field(kw_only=True)
-    basis: Float[Array, "n f"] = eqx.field(kw_only=True)
-
-    def __init__(self, whole: FitProblem, origin: Coordinates, basis: Float[Array, "n f"]):
-        self.experiments, self.names = whole.experiments, whole.names
-        self.parameters, self.starts, self.memory = whole.parameters, whole.starts, whole.memory
-        self.whole, self.origin, self.basis = whole, origin, basis
-
-    @property
-    def size(self) -> int:
-        return self.basis.shape[1]
-
-    @property
-    def dtype(self) -> Any:
-        return self.whole.dtype
-
-    def unrestricted(self, z: Float[Array, "f"]) -> Float[Array, "n"]:
-        return self.origin + self.basis @ z
-
-    def room(self, z: Coordinates) -> Float[Array, "2 f"]:
-        """On planes of some of the coordinates."""
-        return jnp.where(self.basis.T != 0, self.whole.room(self.unrestricted(z))[:, None], jnp.inf).min(axis=2)
-
-    def residuals(self, z: Coordinates, sigmas: Sigmas, adjoint: Any) -> tuple[Array, Array]:
-        return self.whole.residuals(self.unrestricted(z), sigmas, adjoint)
 
 
 _FARTHEST = 14.0  # coordinates that a profile is followed: to a millionth and a million-fold of a positive number

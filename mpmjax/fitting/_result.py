@@ -12,10 +12,19 @@ import numpy as np
 from mpmjax._types import Array
 from mpmjax.checks import require
 from mpmjax.fitting._discretisation import changes_shown
-from mpmjax.fitting._estimate import IMPROBABLE, AbstractFit, Estimate, NoiseEstimate, Shape, improbable, shape_of
+from mpmjax.fitting._estimate import (
+    IMPROBABLE,
+    VALUE,
+    AbstractFit,
+    Estimate,
+    NoiseEstimate,
+    improbable,
+    shape_of,
+    table,
+)
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas, table
+from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
 from mpmjax.fitting._starts import Screening
 from mpmjax.fitting._uncertainty import (
@@ -33,55 +42,32 @@ from mpmjax.state import warn_of_rounding
 
 
 class FitResult(AbstractFit):
-    """Fitted parameters, their errors, and the fitted scene.
+    """Fitted parameters, their errors, and the fitted scene."""
 
-    Attributes:
-        problem: the residuals that were made small.
-        z: the coordinates at the minimum [-], shape (n,).
-        sigmas: the noise of each observation, given or estimated, in the data's unit.
-        residuals: residuals of all observations, then of priors, in units of their noise [-], shape (m,).
-        jacobian: their derivative by the coordinates, shape (m, n).
-        uncertainty: covariance of the coordinates, and the directions that the data do not see.
-        estimates: the fitted numbers, one for each entry of each parameter.
-        reported: the estimates that `report` asked for.
-        chi_squared: Σ r², priors included.
-        degrees_of_freedom: measured numbers and priors, less parameters.
-        noise: the noise of each observation.
-        experiments: the experiments with the fitted values.
-        runs: their runs, without what was observed, where the search made them; else empty.
-        level: the level of the intervals [-], such as 0.95.
-        optimiser: the method of the search.
-        converged: whether the search met its tolerance.
-        history: the iterations of the search.
-        warnings: directions that the data do not see, and a misfit that the noise does not explain, in words.
-        interrupted: whether Ctrl-C ended it.
-        moved: how far z moves on twice the spacing, then with twice the step, shape (2, n); or why that is not known.
-        screening: the other points from which the minimum was searched, if it was.
-        remarks: how its start was come by, in words.
-    """
-
-    problem: FitProblem
-    z: np.ndarray
-    sigmas: Sigmas
-    residuals: np.ndarray
-    jacobian: np.ndarray
-    uncertainty: Uncertainty
-    estimates: tuple[Estimate, ...]
-    reported: tuple[Estimate, ...]
-    chi_squared: float
-    degrees_of_freedom: int
-    noise: tuple[NoiseEstimate, ...]
-    experiments: tuple[Experiment, ...]
-    runs: tuple[Run, ...]
-    level: float
-    optimiser: AbstractOptimiser
-    converged: bool
-    history: tuple[Iteration, ...]
+    problem: FitProblem  # the residuals that were made small
+    z: np.ndarray  # the coordinates at the minimum [-], shape (n,)
+    sigmas: Sigmas  # the noise of each observation, given or estimated, in the data's unit
+    residuals: np.ndarray  # residuals of all observations, then of priors, in units of their noise [-], shape (m,)
+    jacobian: np.ndarray  # their derivative by the coordinates, shape (m, n)
+    uncertainty: Uncertainty  # covariance of the coordinates, and the directions that the data do not see
+    estimates: tuple[Estimate, ...]  # the fitted numbers, one for each entry of each parameter
+    reported: tuple[Estimate, ...]  # the estimates that `report` asked for
+    chi_squared: float  # Σ r², priors included
+    degrees_of_freedom: int  # measured numbers and priors, less parameters
+    noise: tuple[NoiseEstimate, ...]  # the noise of each observation
+    experiments: tuple[Experiment, ...]  # the experiments with the fitted values
+    runs: tuple[Run, ...]  # their runs, without what was observed, where the search made them; else empty
+    level: float  # the level of the intervals [-], such as 0.95
+    optimiser: AbstractOptimiser  # the method of the search
+    converged: bool  # whether the search met its tolerance
+    history: tuple[Iteration, ...]  # the iterations of the search
     warnings: tuple[str, ...]
-    interrupted: bool = False
+    """Directions that the data do not see, and a misfit that the noise does not explain, in words."""
+    interrupted: bool = False  # whether Ctrl-C ended it
     moved: np.ndarray | str | None = None
-    screening: Screening | None = None
-    remarks: tuple[str, ...] = ()
+    """How far z moves on twice the spacing, then with twice the step, shape (2, n); or why that is not known."""
+    screening: Screening | None = None  # the other points from which the minimum was searched, if it was
+    remarks: tuple[str, ...] = ()  # how its start was come by, in words
 
     @property
     def values(self) -> dict[str, np.ndarray]:
@@ -170,7 +156,7 @@ class FitResult(AbstractFit):
 
     def restarted(self, parameters: Mapping[str, AbstractParameter]) -> dict[str, AbstractParameter]:
         """The parameters, to be searched from the fitted values."""
-        return restarted(parameters, self.values)
+        return {name: replace(p, start=self.values[name]) for name, p in parameters.items()}
 
     def warn_of_runs(self) -> None:
         """Give the warnings of the fitted experiments' runs, which give none while they are searched for."""
@@ -204,52 +190,26 @@ class FitResult(AbstractFit):
             if start.size <= _MOST_ROWS:
                 rows += each
                 continue
-            values, errors = (np.array([getattr(e, field) for e in each]) for field in ("value", "error"))
-            unit = f" [{each[0].unit}]" if each[0].unit else ""
-            many.append(
-                f"{name + unit:<24} {' x '.join(map(str, start.shape))} numbers, {values.min():.4g} to "
-                f"{values.max():.4g}, median {np.median(values):.4g}; errors {errors.min():.2g} to "
-                f"{errors.max():.2g}, median {np.median(errors):.2g}"
-            )
-        head = ["", f"{'value':>12} ± {'error':<9}", f"{100 * self.level:g} % interval", f"{'start':>10}", ""]
-        cells = [
-            [e.name, *e.cells, "" if np.isnan(e.start) else f"{e.start:>10.4g}", "at its bound" if e.at_bound else ""]
-            for e in (*rows, *self.reported)
-        ]
-        if any(e.interval != e.noise_interval for e in self.all):
-            head.insert(3, "by noise alone")
-            for e, cell in zip((*rows, *self.reported), cells, strict=True):
-                cell.insert(3, f"{e.noise_interval[0]:.5g} to {e.noise_interval[1]:.5g}")
-        first, *body = table(head, *cells)
+            of_all = (([e.value for e in each], 4), ([e.error for e in each], 2))
+            value, error = (f"{min(a):.{n}g} to {max(a):.{n}g}, median {np.median(a):.{n}g}" for a, n in of_all)
+            what = each[0]._replace(label=name).name
+            many.append(f"{what:<24} {' x '.join(map(str, start.shape))} numbers, {value}; errors {error}")
+        widened = any(e.interval != e.noise_interval for e in self.all)
+        alone = ["by noise alone"] if widened else []
+        head = "", VALUE.format("value"), f"{100 * self.level:g} % interval", *alone, f"{'start':>10}", ""
+        first, *body = table(head, *(e.row(widened) for e in (*rows, *self.reported)))
         shapes = any(n.shape for n in self.noise)
         noise = table(
-            ("", f"{'numbers':>12}", "noise σ", "misfit/σ", "residuals" if shapes else ""),
-            *(
-                (
-                    n.name,
-                    f"{n.points:>12}",
-                    f"{n.sigma:.3g} {'estimated' if n.estimated else 'given'}",
-                    f"{n.misfit:.3g}",
-                    n.shape and f"{n.shape}: worth {n.worth:.2g} independent numbers",
-                )
-                for n in self.noise
-            ),
+            ("", f"{'numbers':>12}", "noise σ", "misfit/σ", "residuals" if shapes else ""), *(n.row for n in self.noise)
         )
         chi = f"χ² = {self.chi_squared:.4g} for {self.degrees_of_freedom} degrees of freedom"
         chi += "" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}"
         who = f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations"
         lost = [] if self.converged else ["NOT CONVERGED: errors hold only at a minimum."]
-        looked = [] if self.screening is None else ["", str(self.screening)]
         lost += changes_shown(self.problem, self.z, self.moved)
+        looked = [] if self.screening is None else ["", str(self.screening)]
         before = [*self.remarks, ""] if self.remarks else []
         return "\n".join([*before, first, *many, *body, "", *noise, "", chi, who, *lost, *self.warnings, *looked])
-
-
-def restarted(
-    parameters: Mapping[str, AbstractParameter], values: Mapping[str, np.ndarray]
-) -> dict[str, AbstractParameter]:
-    """Parameters, to be searched from these values."""
-    return {name: replace(p, start=values[name]) for name, p in parameters.items()}
 
 
 Noise = list[tuple[Array, float, float]]
@@ -299,20 +259,16 @@ def fit_result(
         # What is left of exact data is the search's and rounding's.
         measured = misfit * size > max(_EXACT, _ROUNDINGS * eps) * o.scale() and np.isfinite(ratio)
         missed = is_given and o.trust == (1.0, None) and improbable((r[rows] ** 2).sum(), left)
-        x = o.against[1]
-        shape = shape_of(r[rows].reshape(len(x), -1)[np.argsort(x)]) if measured else Shape(1.0, "")
-        # A misfit that noise explains does not make a correlation larger.
-        wider = o.trust[0] * shape.factor * (ratio if missed else min(ratio, 1)) ** 2
-        if not (measured and wider > 1):
-            wider, shape = 1.0, Shape(1.0, "")
-        freedom = freedom if not is_given else np.inf
+        x, wider = o.against[1], 1.0
+        factor, kind = shape_of(r[rows].reshape(len(x), -1)[np.argsort(x)]) if measured else (1.0, "")
+        if measured:  # a misfit that noise explains does not make a correlation larger
+            wider = max(o.trust[0] * factor * (ratio if missed else min(ratio, 1)) ** 2, 1.0)
+        factor, kind = (factor, kind) if wider > 1 else (1.0, "")
+        freedom = np.inf if is_given else freedom
         of_noise.append((rows, 1.0, freedom))
-        of_misfit.append((rows, wider, freedom if wider == 1 else max(left / shape.factor, _LEAST_FREEDOM)))
-        beyond = missed or bool(shape.kind and not is_given)
-        worth = o.count / shape.factor
-        noises.append(
-            NoiseEstimate(o.name, float(size), not is_given, float(misfit), o.count, worth, shape.kind, beyond)
-        )
+        of_misfit.append((rows, wider, freedom if wider == 1 else max(left / factor, _LEAST_FREEDOM)))
+        beyond, worth = missed or bool(kind and not is_given), o.count / factor
+        noises.append(NoiseEstimate(o.name, float(size), not is_given, float(misfit), o.count, worth, kind, beyond))
     held, slope = at_bound(r, J, np.asarray(problem.room(z))), jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1]
     gradient, columns = (J.T @ r) * held, [problem.numbers(z), problem.numbers(jnp.zeros_like(z)), held]
     noise_alone, errors = uncertainty(J, eps, of_noise), uncertainty(J, eps, of_misfit, moved)
@@ -328,15 +284,15 @@ def fit_result(
         def value(z: Coordinates, of: Callable[[Experiment], Any] = of) -> Array:
             return jnp.asarray(of(problem.at(z)[0]))
 
-        number, derivative, both = float(value(z)), np.asarray(jax.jacfwd(value)(z), float), []
+        number, start, both = float(value(z)), float(value(jnp.zeros_like(z))), []
         for each in (errors, noise_alone):
-            error, freedom = each.of(derivative)
+            error, freedom = each.of(np.asarray(jax.jacfwd(value)(z), float))
             reach = float(quantile(level, freedom) * error)
             both.append((float(error), (number - reach, number + reach)))
-        start = float(value(jnp.zeros_like(z)))
-        (error, ends), (by_noise, noise_ends) = both
-        reported.append(Estimate(name, number, error, ends, "", start, False, by_noise, noise_ends))
+        (error, ends), by_noise = both
+        reported.append(Estimate(name, number, error, ends, "", start, False, *by_noise))
     degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
+    texts = seen_together(problem.labels, errors, problem.logarithmic)
     result = FitResult(
         problem=problem,
         z=np.asarray(z),
@@ -358,11 +314,10 @@ def fit_result(
         optimiser=optimiser,
         converged=minimum.converged,
         history=minimum.history,
-        warnings=tuple(seen_together(problem.labels, errors, problem.logarithmic)),
+        warnings=(),
         interrupted=minimum.interrupted,
         moved=moved,
     )
-    texts = list(result.warnings)
     if result.p_value < IMPROBABLE:
         texts.append(
             f"The misfit is {np.sqrt(result.chi_squared / result.degrees_of_freedom):.2g} times the noise given: the "

@@ -15,13 +15,13 @@ import numpy as np
 from mpmjax._types import Scalar
 from mpmjax.analysis import sensitivity
 from mpmjax.checks import checked, require, require_positive, warn
-from mpmjax.fitting._estimate import AbstractFit, Estimate, NoiseEstimate
+from mpmjax.fitting._estimate import VALUE, AbstractFit, Estimate, NoiseEstimate, table
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._fit import chosen_optimiser, fit, require_derivative
+from mpmjax.fitting._fit import chosen_optimiser, fit, require_end
 from mpmjax.fitting._observation import Series
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem, table
-from mpmjax.fitting._result import FitResult, restarted
+from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._result import FitResult
 from mpmjax.fitting._search import AbstractOptimiser, begin, iterate, jacobian, search
 from mpmjax.fitting._starts import Starts, as_starts
 from mpmjax.fitting._uncertainty import quantile
@@ -70,8 +70,7 @@ def fit_staged(
         SimulationError: the simulation at the first guess meets a fault within the first horizon.
     """
     require(float(growth) > 0, f"growth must be positive, or infinite to use all data, got {growth}.")
-    times = None if horizons is None else [float(t) for t in horizons]
-    if times is not None:
+    if (times := None if horizons is None else [float(t) for t in horizons]) is not None:
         require(len(times) > 0, "horizons must hold a time at least; leave them out to have them chosen.")
         require_positive("horizons [s]", np.array(times))
         require(all(a < b for a, b in pairwise(times)), f"horizons must grow, got {times}.")
@@ -86,8 +85,9 @@ def fit_staged(
 
     z = jnp.zeros(problem.size, problem.dtype)
     limits = _limits(problem.at(z), float(growth))
+    whole = _cut(problem, limits, end)
     if times is None:
-        first = _first_horizon(_cut(problem, limits, end), optimiser, z)
+        first = _first_horizon(whole, optimiser, z)
         times = [first * 2.0**k for k in range(_MOST_STAGES) if first * 2.0**k < _NEARLY_ALL * end]
         tell(
             f"The first horizon is {first:.4g} s of {end:.4g} s: until then a change of one in a coordinate changes "
@@ -98,29 +98,27 @@ def fit_staged(
         )
     for horizon in times:
         cut = _cut(problem, limits, horizon)
-        if [e.steps for e in cut.experiments] == [e.steps for e in _cut(problem, limits, end).experiments]:
+        if [e.steps for e in cut.experiments] == [e.steps for e in whole.experiments]:
             break
         minimum = search(cut, optimiser, z, cut.first_sigmas)
-        if minimum.interrupted:
-            raise KeyboardInterrupt
-        require_derivative(minimum)
+        require_end(minimum)
         if minimum.failure:
             cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
         z, misfit, count = minimum.z, cut.misfit(minimum.cost), len(minimum.history)
         tell(f"until {horizon:.4g} s: misfit/σ {misfit:.4g}, {problem.shown(z)}, {count} iterations")
         limits = _limits(problem.at(z), float(growth))
-    cut = _cut(problem, limits, end)
-    for k, (whole, used, limit) in enumerate(zip(problem.experiments, cut.experiments, limits, strict=True)):
-        if used.steps < whole.steps:
+        whole = _cut(problem, limits, end)
+    for k, (e, used, limit) in enumerate(zip(problem.experiments, whole.experiments, limits, strict=True)):
+        if used.steps < e.steps:
             tell(
-                f"Of the experiment {whole.name!r} (number {k}) data are used only until {limit:.4g} s of "
-                f"{whole.t1:.4g} s: beyond, derivatives grow to more than {growth:.3g} times those of free flight, or "
+                f"Of the experiment {e.name!r} (number {k}) data are used only until {limit:.4g} s of "
+                f"{e.t1:.4g} s: beyond, derivatives grow to more than {growth:.3g} times those of free flight, or "
                 "the simulation fails, and a fit would follow chance. Give windows of the later motion, each from an "
                 "observed state, as experiments of their own."
             )
             warn(remarks[-1])
-    start = restarted(parameters, problem.by_name(z))
-    result = fit(cut.experiments, start, report=report, level=level, optimiser=optimiser, progress=progress)
+    start = {name: replace(parameters[name], start=value) for name, value in problem.by_name(z).items()}
+    result = fit(whole.experiments, start, report=report, level=level, optimiser=optimiser, progress=progress)
     return replace(result, remarks=tuple(remarks))
 
 
@@ -140,8 +138,7 @@ def _limits(experiments: Sequence[Experiment], growth: float) -> list[float]:
             warnings.simplefilter("ignore")
             grown = sensitivity(e.scene, e.particles, t1=e.t1, dt=e.dt, method=e.method)
         beyond = np.flatnonzero(~(np.asarray(grown.growth) <= growth))
-        times = np.asarray(grown.times)
-        limits.append(e.t1 if len(beyond) == 0 else float(times[max(beyond[0] - 1, 0)]))
+        limits.append(float(np.asarray(grown.times)[max(beyond[0] - 1, 0)]) if len(beyond) else e.t1)
     return limits
 
 
@@ -152,22 +149,21 @@ def _first_horizon(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordin
     if not np.isfinite(seen.cost):
         problem.explain(z)
     J = np.asarray(jacobian(problem, z, sigmas)[1] if seen.jacobian is None else seen.jacobian, float)
-    times, changes, motions = [], [], []
+    parts = []
     for o, rows, sigma in zip(problem.observations, problem.rows, sigmas, strict=True):
         if isinstance(o, Series):
-            times.append(o.times)
-            changes.append((J[rows] ** 2).reshape(len(o.times), -1, problem.size).sum(axis=1))
+            change = (J[rows] ** 2).reshape(len(o.times), -1, problem.size).sum(axis=1)
             data = o.data.reshape(len(o.times), -1)
             measured, spread = np.isfinite(data), np.broadcast_to(np.asarray(sigma), o.data.shape).reshape(data.shape)
             first = data[measured.argmax(axis=0), np.arange(data.shape[1])]
             # Σ ((y − y(0))/σ)² at each time, y(0) the first that was measured of each number
-            motions.append(np.asarray(o.weight) * (np.where(measured, (data - first) / spread, 0) ** 2).sum(axis=1))
-    if not times:
+            motion = np.asarray(o.weight) * (np.where(measured, (data - first) / spread, 0) ** 2).sum(axis=1)
+            parts.append((o.times, change, motion))
+    if not parts:
         return max(e.t1 for e in problem.experiments)
-    order = np.argsort(np.concatenate(times), kind="stable")
-    t = np.concatenate(times)[order]
-    change = np.cumsum(np.concatenate(changes)[order], axis=0)
-    motion = np.cumsum(np.concatenate(motions)[order])
+    t, change, motion = map(np.concatenate, zip(*parts, strict=True))
+    order = np.argsort(t, kind="stable")
+    t, change, motion = t[order], np.cumsum(change[order], axis=0), np.cumsum(motion[order])
     usable = (motion > 0) & (np.arange(1, len(t) + 1) >= min(_LEAST_TIMES, len(t)))
     if not usable.any():
         return float(t[-1])
@@ -190,19 +186,18 @@ class RefinedFit(AbstractFit):
 
     def __str__(self) -> str:
         """A table: the estimates on each grid and the extrapolated ones."""
-        rows = []
+        names, rows = [f"spacing/{n}" for n in self.refinements], []
         for k, e in enumerate(self.estimates):
             rules = "noise" if self.from_noise[k] > self.from_discretisation[k] else "discretisation"
             rules = "one grid alone" if len(self.fits) == 1 else rules
             grids = (f"{result.all[k].value:>13.6g}" for result in self.fits)
             rows.append((e.name, *grids, *e.cells, rules + ("  at its bound" if e.at_bound else "")))
-        grids = (f"{f'spacing/{n}':>13}" for n in self.refinements)
-        level = f"{100 * self.fits[-1].level:g} % interval"
-        lines = table(("", *grids, f"{'extrapolated':>12} ± {'error':<9}", level, "what rules"), *rows)
-        for n, each in zip(self.refinements, self.fits, strict=True):
-            lines += [f"spacing/{n}: {text}" for text in each.warnings]
-            lines += [] if each.converged else [f"spacing/{n}: NOT CONVERGED"]
-            lines += [] if each.screening is None else [f"spacing/{n}: {each.screening}"]
+        head = (*(f"{name:>13}" for name in names), VALUE.format("extrapolated"))
+        lines = table(("", *head, f"{100 * self.fits[-1].level:g} % interval", "what rules"), *rows)
+        for name, each in zip(names, self.fits, strict=True):
+            lost = [] if each.converged else ["NOT CONVERGED"]
+            looked = [] if each.screening is None else [each.screening]
+            lines += [f"{name}: {text}" for text in (*each.warnings, *lost, *looked)]
         return "\n".join([*lines, *([self.remark] if self.remark else [])])
 
 
@@ -230,22 +225,20 @@ def fit_refined(
 
         print(mpm.fitting.fit_refined(build, {"E": ...}))
 
-    With estimates a and b on the two finest grids, logarithms of `Positive` parameters, and their spacings in the
-    ratio r, the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and the standard error that is left of
-    the discretisation is taken as that whole correction. p is `order`; with three grids of equal ratios it is what
-    they show, between half and twice that. A higher order than `order` may be shown by grids that are too coarse to
-    tell, so the error then is the correction by `order`. Where the estimates do not converge, or one lies at its
-    bound, which tells nothing of where it would be without, the finest stays, with its last change as the error, and
-    a warning says so.
+    With estimates a and b on the two finest grids, logarithms of `Positive` parameters, and spacings in the ratio r,
+    the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and that whole correction is taken as the standard
+    error that is left of the discretisation. p is `order`; with three grids of equal ratios it is what they show,
+    between half and twice that, but the error is no less than by `order`, for grids may be too coarse to tell. Where
+    the estimates do not converge, or one lies at its bound, the finest stays, with its last change as the error, and a
+    warning says so.
 
-    Two estimates may agree by chance and both be wrong, as where an error changes its sign between the grids. What the
-    finest grid misses of the data then tells more: D, in units of σ. A discretisation that changes predictions by D in
-    ways that no parameter can follow may change them as much in ways that a parameter does follow. The parameter that
-    makes up for it moves by D times its standard error from the noise; half of this is the least error that is taken.
-    D² is what the sum of squares loses from the grid before to the finest, over r^2p − 1, and needs no σ.
+    Two estimates may agree by chance and both be wrong. What the finest grid misses of the data then tells more: D, in
+    units of σ. A discretisation that changes predictions by D in ways that no parameter can follow may do as much in
+    ways that one does follow, which moves it by D times its standard error from the noise; half of this is the least
+    error that is taken. D² is what Σ r² loses from the grid before to the finest, over r^2p − 1, and needs no σ.
 
-    Intervals are made of the noise's and the discretisation's part, and keep to the bounds. After Ctrl-C it returns
-    what it has, and extrapolates from grids on which the fit was done.
+    Intervals hold the noise's and the discretisation's part, and keep to the bounds. After Ctrl-C it returns what it
+    has, and extrapolates from grids on which the fit was done.
 
     Args:
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
@@ -265,22 +258,12 @@ def fit_refined(
         f"refinements must be two or more growing whole numbers, got {numbers}.",
     )
     require_positive("order", order)
-    fits: list[FitResult] = []
-    start, places = parameters, as_starts(starts)
+    fits, start, places = list[FitResult](), parameters, as_starts(starts)
+    options: dict[str, Any] = {"report": report, "level": level, "optimiser": optimiser, "progress": progress}
     for n in numbers:
         path = None if log is None else Path(log).with_stem(f"{Path(log).stem}_{n}")
-        result = fit(
-            build(n),
-            start,
-            starts=places,
-            discretisation=False,
-            report=report,
-            level=level,
-            optimiser=optimiser,
-            progress=progress,
-            log=path,
-            resume=resume and path is not None and (path.exists() or n == numbers[0]),
-        )
+        goes_on = resume and path is not None and (path.exists() or n == numbers[0])
+        result = fit(build(n), start, starts=places, discretisation=False, log=path, resume=goes_on, **options)
         if not result.interrupted or not fits:
             fits.append(result)
         if result.interrupted:
@@ -291,15 +274,12 @@ def fit_refined(
     numbers = numbers[: len(fits)]
     if len(fits) < len(refinements):
         warn(f"The fit on several grids was interrupted: of {len(refinements)} grids it tells of {len(fits)}.")
-    kinds = [*fits[-1].problem.owners, *[None] * len(fits[-1].reported)]
-    each = zip(kinds, zip(*(result.all for result in fits), strict=True), strict=True)
-    normal = float(quantile(float(level), np.inf))
-    missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order)) if len(fits) > 1 else 0.0
-    remark = ""
+    missed, remark = 0.0, ""
+    if len(fits) > 1:
+        missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order))
     if len(fits) > 1 and fits[-1].is_beyond:
         before, after = _squares(fits[-2].noise, fits[-1].noise)
-        points = sum(n.points for n in fits[-1].noise)
-        by_noise = sum(n.points for n in fits[-1].noise if not n.estimated)
+        points, by_noise = (sum(n.points for n in fits[-1].noise if all_of or not n.estimated) for all_of in (1, 0))
         falls = after - by_noise < _FALLS * (before - by_noise)
         shown = f"{np.sqrt(before / points):.3g} σ on {numbers[-2]}, {np.sqrt(after / points):.3g} σ on {numbers[-1]}"
         remark = (
@@ -309,7 +289,10 @@ def fit_refined(
             "not the discretisation. Take more starts, or another law."
         )
         warn(remark)
-    extrapolated = [_extrapolate(kind, of, numbers, float(order), missed, normal) for kind, of in each]
+    kinds = [*fits[-1].problem.owners, *[None] * len(fits[-1].reported)]
+    each = zip(kinds, zip(*(result.all for result in fits), strict=True), strict=True)
+    normal = float(quantile(float(level), np.inf))
+    extrapolated = (_extrapolate(kind, of, numbers, float(order), missed, normal) for kind, of in each)
     estimates, left, orders = zip(*extrapolated, strict=True)
     parts = {"from_noise": tuple(e.error for e in fits[-1].all), "from_discretisation": left, "order": orders}
     return RefinedFit(fits=tuple(fits), refinements=tuple(numbers), estimates=estimates, **parts, remark=remark)
@@ -387,7 +370,5 @@ def _extrapolate(
 _MOST_STAGES = 20
 _NEARLY_ALL = 0.75  # a horizon beyond this part of the end is the end
 _LEAST_TIMES = 4  # how many measured times the first horizon has, at least
-_FALLS = (
-    0.7  # part of a misfit's squares beyond the noise, below which it falls with the spacing; of order 1/2 one half
-)
+_FALLS = 0.7  # part of a misfit's squares beyond the noise, below which it falls with the spacing; of order 1/2 a half
 _GROWN = 1.2  # a ratio that grows by no more than this factor does not grow

@@ -11,9 +11,10 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Int, Scalar
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_whole
+from mpmjax.fitting._estimate import table
 from mpmjax.fitting._evaluation import costs_at
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas, table
+from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas
 from mpmjax.fitting._search import AbstractOptimiser, Search, batch_size, counted, search_many
 
 Ends = list[tuple[Search, list[int]]]  # minima, with the numbers of the points that led there
@@ -25,21 +26,20 @@ class Starts(eqx.Module):
         result = mpm.fit(pull, {"E": ...}, starts=mpm.fitting.Starts(64, ranges={"E": (1e4, 1e7)}))
         print(result)
 
-    The points are the first guess, `points` of your own, and scrambled Sobol points (see `ranges`). The simulation runs
-    once at each of them, without derivatives. Searches start from the first guess, from your own points, from a
-    fraction of the others, the best ones, and from each that has no better one within the critical distance of
-    multi-level single linkage (A. H. G. Rinnooy Kan, G. T. Timmer, Mathematical Programming 39 (1987) 57-78). They
-    stand for the others, each of which is linked to the nearest better one. Where a search comes to no minimum, the
-    points that it stood for are linked anew, without it.
+    The points are the first guess, `points` of your own, and scrambled Sobol points (see `ranges`), with a simulation
+    each, without derivatives. Searches start from the first guess, your own points, a fraction of the others, the best
+    ones, and from each without a better one within the critical distance of multi-level single linkage (A. H. G.
+    Rinnooy Kan, G. T. Timmer, Mathematical Programming 39 (1987) 57-78). They stand for the others, each linked to the
+    nearest better one, and linked anew where that search comes to no minimum. What fails hinders no others.
 
-    Points and searches whose simulation fails hinder no others. A search that comes within a hundredth, in each
-    coordinate, of another with a lower cost is ended, and counted where that one ends; one whose sum of squares three
-    moves, or six iterations, have lowered by less than a hundredth is ended there, as at a minimum. Those that come
-    within twice the least sum of squares are searched on, and the best is then fitted as from a single start.
+    A search that comes within a hundredth, in each coordinate, of another with a lower cost is ended, and counted where
+    that one ends; one whose sum of squares three moves, or six iterations, have lowered by less than a hundredth is
+    ended as at a minimum. Those within twice the least sum of squares are searched on, and the best is then fitted as
+    from a single start.
 
-    Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the misfit
-    hides the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, J and s² = Σ r²/(m − n), or one if σ is given and that is
-    less, being those of the better one. Where σ is not given, all searches take that of the first one.
+    Two searches ended at one minimum where their coordinates differ by less than two hundredths, or the misfit hides
+    the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, with J and s² = Σ r²/(m − n) of the better one, s² at least one
+    where σ is given. Where it is not, all searches take that of the first one.
 
     Args:
         count: how many points, the first guess among them, your own not.
@@ -299,13 +299,9 @@ def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], frac
     """For each point the number of the one that stands for it, from which a search starts; its own where one starts
     there, and -1 where the cost is not finite.
 
-    In multi-level single linkage a search starts from each point that has no better one within the critical distance
-
-        r = π^(-1/2) (Γ(1 + n/2) σ ln k / k)^(1/n),  σ = 2,
-
-    of k even points of the unit cube: in a ball of this radius lie σ ln k of them. Any other point is linked to the
-    nearest better one, and so on to one that is searched from. On a rough function that is too few: a fraction of all
-    points, the best ones, is searched from besides.
+    In multi-level single linkage a search starts from each point that has no better one within the critical distance;
+    any other is linked to the nearest better one, and so on to one that is searched from. On a rough function that is
+    too few: a fraction of all points, the best ones, is searched from besides.
 
     Args:
         shares: the points, evenly spread over the unit cube.
@@ -326,7 +322,8 @@ def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], frac
 
 
 def critical_distance(count: int, size: int) -> float:
-    """The radius of a ball in which σ ln k of k points of the unit cube of n dimensions lie, but for its boundary."""
+    """π^(-1/2) (Γ(1 + n/2) σ ln k / k)^(1/n): the radius of a ball in which σ ln k of k even points of the unit cube of
+    n dimensions lie, but for its boundary."""
     if count < 2:
         return 0.0
     logarithm = math.lgamma(1 + size / 2) + np.log(_SIGMA * np.log(count) / count)

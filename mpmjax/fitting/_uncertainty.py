@@ -218,28 +218,17 @@ def seen_together(labels: tuple[str, ...], errors: Uncertainty, logarithmic: tup
 
 
 class Prediction(NamedTuple):
-    """A quantity by a fit, with the error that the parameters' errors make. All arrays have its shape.
+    """A quantity by a fit, with the error that the parameters' errors make. All arrays have its shape."""
 
-    Attributes:
-        value: the quantity at the fit.
-        error: standard error; infinite where the value depends on what the data do not see.
-        lower: where the value lies at the level: the confidence band. It holds at each point, not at all of them
-            together.
-        upper: the band's upper end.
-        sigma: standard deviation of the noise of a measurement of it, where that is known.
-        new_lower: where a new measurement lies at the level, its noise included: the prediction band.
-        new_upper: the prediction band's upper end.
-        level: the level of the bands [-], such as 0.95.
-    """
-
-    value: np.ndarray
-    error: np.ndarray
+    value: np.ndarray  # the quantity at the fit
+    error: np.ndarray  # standard error; infinite where the value depends on what the data do not see
     lower: np.ndarray
-    upper: np.ndarray
-    sigma: np.ndarray | None
-    new_lower: np.ndarray | None
-    new_upper: np.ndarray | None
-    level: float
+    """Where the value lies at the level: the confidence band. It holds at each point, not at all of them together."""
+    upper: np.ndarray  # the band's upper end
+    sigma: np.ndarray | None  # standard deviation of the noise of a measurement of it, where that is known
+    new_lower: np.ndarray | None  # where a new measurement lies at the level, its noise included: the prediction band
+    new_upper: np.ndarray | None  # the prediction band's upper end
+    level: float  # the level of the bands [-], such as 0.95
 
 
 def banded(

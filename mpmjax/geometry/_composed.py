@@ -45,8 +45,7 @@ class AbstractComposed(AbstractRegion):
 
 
 class Union(AbstractComposed):
-    """The union of several regions. Its distance is exact outside; inside, where regions overlap, it may be too small
-    in magnitude.
+    """The union of several regions. Its distance is exact outside; inside, where they overlap, it may be too small.
 
     Args:
         regions: the regions.
@@ -107,16 +106,12 @@ class Complement(AbstractRegion):
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         return -self.region.distance(x)
 
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.full(self.dim, -np.inf), np.full(self.dim, np.inf)
-
     def middle(self) -> Float[Array, "d"]:
         return self.region.middle()
 
 
 class Placed(AbstractRegion):
-    """A region in another place: mirrored, then turned about a centre, then moved, x = c + u + R M (X − c), with
-    M = I − 2 n nᵀ of the unit normal n.
+    """A region mirrored, turned about a centre and moved: x = c + u + R M (X − c), M = I − 2 n nᵀ, n the unit normal.
 
     Args:
         region: the region.

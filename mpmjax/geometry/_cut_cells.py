@@ -13,16 +13,12 @@ from mpmjax._types import Array, Float
 from mpmjax.checks import canonical, require, require_memory
 from mpmjax.geometry._region import AbstractRegion
 
-_BATCH = 4096
-"""Points that are computed together: one compiled program serves any number of them."""
+_BATCH = 4096  # points that are computed together: one compiled program serves any number of them
 _HALVINGS = 2
 """How often a cell that the surface cuts is halved in each direction, before the surface is taken as a plane."""
-_LINES = 4
-"""Lines across a cell, in each direction, along which the plane is cut."""
-_ON_IT = 1e-9
-"""Distance within which a point is on a surface, in spacings."""
-_ROUNDINGS = 8.0
-"""The least such distance, in roundings of the greatest coordinate."""
+_LINES = 4  # lines across a cell, in each direction, along which the plane is cut
+_ON_IT = 1e-9  # distance within which a point is on a surface, in spacings
+_ROUNDINGS = 8.0  # the least such distance, in roundings of the greatest coordinate
 
 
 def _batched(
@@ -71,8 +67,7 @@ def inside_parts(region: AbstractRegion, centres: np.ndarray, size: np.ndarray) 
 
 
 def _moments(region: AbstractRegion, centres: np.ndarray, size: np.ndarray, halvings: int) -> np.ndarray:
-    """∫ (1, y) dy over the part of each cell that is inside, over the cell's volume, shape (m, 1 + d); y from the
-    centre."""
+    """∫ (1, y) dy over the part of each cell that is inside, over its volume, shape (m, 1 + d); y from the centre."""
     d = len(size)
     distance, normal = _batched(_distance_and_gradient, region, centres)
     reach = np.linalg.norm(size) / 2
@@ -120,12 +115,9 @@ def _by_plane(distance: np.ndarray, normal: np.ndarray, size: np.ndarray) -> np.
 class Pieces(NamedTuple):
     """Flat pieces of a surface: points, segments or triangles."""
 
-    corners: np.ndarray
-    """Their corners [m], shape (s, d, d)."""
-    normal: np.ndarray
-    """Their outward unit normals, shape (s, d)."""
-    inner: np.ndarray
-    """Whether a piece lies off the boundary of the regions that clipped it, shape (s,)."""
+    corners: np.ndarray  # their corners [m], shape (s, d, d)
+    normal: np.ndarray  # their outward unit normals, shape (s, d)
+    inner: np.ndarray  # whether a piece lies off the boundary of the regions that clipped it, shape (s,)
 
     @property
     def middle(self) -> np.ndarray:
@@ -189,9 +181,8 @@ def surface_pieces(
     for side in range(values.shape[1]):
         parts = [_cut(*corners) for corners in _simplices(points, values[:, side].reshape(counts))]
         corners, outward = (np.concatenate(part) for part in zip(*parts, strict=True))
-        pieces = _clipped(
-            _sized(Pieces(corners, outward, np.ones(len(corners), bool)), spacing), region, near, but=side
-        )
+        pieces = _sized(Pieces(corners, outward, np.ones(len(corners), bool)), spacing)
+        pieces = _clipped(pieces, region, near, but=side)
         of_sides.append(pieces if within is None else _clipped(pieces, within, near))
     return _sized(Pieces(*(np.concatenate(part) for part in zip(*of_sides, strict=True))), spacing)
 

@@ -1,5 +1,4 @@
-"""Prescribed motions. They are data, not callables, so that they can be saved, differentiated and changed without
-compiling anew."""
+"""Prescribed motions. They are data, no callables: saved, differentiated and changed without compiling anew."""
 
 from functools import partial
 from typing import Any, ClassVar
@@ -58,7 +57,6 @@ class AbstractMotion(eqx.Module):
 
     def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """The vectors a, fixed in the body, as turned by it at time t, both (m, d)."""
-        del t
         return a
 
     def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
@@ -84,7 +82,7 @@ class Motion(AbstractMotion):
 
     def __check_init__(self):
         require_fields(self)
-        _check_rows("A motion", self.times, self.displacement)
+        _check_rows("A motion's", "displacement", self.times, self.displacement)
 
     def rests(self) -> bool:
         return _constant(self.displacement)
@@ -119,7 +117,7 @@ class RigidMotion(AbstractMotion):
 
     def __check_init__(self):
         require_fields(self)
-        _check_rows("A rigid motion", self.times, self.displacement)
+        _check_rows("A rigid motion's", "displacement", self.times, self.displacement)
         d, shape = self.dim, shape_of(self.rotation)
         require(d in (2, 3), f"A rigid motion is two- or three-dimensional, got {d} coordinates: take a Motion.")
         expected = (len(self.times),) if d == 2 else (len(self.times), 3)
@@ -174,15 +172,17 @@ def _constant(rows: Any) -> bool:
     return bool((np.ptp(np.asarray(rows), axis=0) == 0).all())
 
 
-def _check_rows(name: str, times: Times, displacement: Displacements) -> None:
-    j, rows = shape_of(times), shape_of(displacement)
+def _check_rows(owner: str, values: str, times: Times, rows: Any, *, axes: tuple[int, ...] = (2,)) -> None:
+    """Check that increasing times have one row each of some values, with so many axes."""
+    j, shape = shape_of(times), shape_of(rows)
+    kind = "row" if axes == (2,) else "number or row"
     require(
-        len(j) == 1 and len(rows) == 2 and j[0] == rows[0],
-        f"{name} needs one row of displacements a time, got shapes {j} and {rows}.",
+        len(j) == 1 and len(shape) in axes and j[0] == shape[0] > 0,
+        f"{owner} {values} must be one {kind} a time, one time at least, got shapes {j} and {shape}.",
     )
-    require_finite(f"{name}'s times", times)
-    require_finite(f"{name}'s displacement", displacement)
-    require_that(f"{name}'s times must increase", lambda t: t[1:] > t[:-1], times)
+    require_finite(f"{owner} times", times)
+    require_finite(f"{owner} {values}", rows)
+    require_that(f"{owner} times must increase", lambda t: t[1:] > t[:-1], times)
 
 
 def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j *c"]) -> Float[Array, "*c"]:
@@ -195,8 +195,7 @@ def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j *
 def _change(t: Scalar, dt: Scalar, times: Float[Array, "j"], values: Float[Array, "j c"]) -> Float[Array, "c"]:
     """The change of each column from t to t + dt, computed from the slopes.
 
-    A difference of two values would have their rounding, which divided by dt = 1e-5 s is a thousandth of the velocity
-    in single precision.
+    A difference would have the values' rounding: over dt = 1e-5 s a thousandth of the velocity in single precision.
     """
     slopes = jnp.diff(values, axis=0) / jnp.diff(times)[:, None]
     within = jnp.diff(jnp.clip(times - t, 0, dt))  # the part of the step that lies between two times
@@ -245,14 +244,7 @@ class TimeSeries(eqx.Module):
 
     def __check_init__(self):
         require_fields(self)
-        j, rows = shape_of(self.times), shape_of(self.values)
-        require(
-            len(j) == 1 and len(rows) in (1, 2) and j[0] == rows[0] > 0,
-            f"A time series needs one value or vector a time, got shapes {j} and {rows}.",
-        )
-        require_finite("A time series' times", self.times)
-        require_finite("A time series' values", self.values)
-        require_that("A time series' times must increase", lambda t: t[1:] > t[:-1], self.times)
+        _check_rows("A time series'", "values", self.times, self.values, axes=(1, 2))
 
     def at(self, t: Scalar) -> Float[Array, "..."]:
         """The value at time t, a number or of shape (d,)."""

@@ -36,9 +36,9 @@ class AbstractRegion(eqx.Module):
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """Signed distance of points x [m], shape (m, d), from the surface [m], shape (m,); negative inside."""
 
-    @abc.abstractmethod
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner of the bounding box [m], each (d,)."""
+        """Lower and upper corner of the bounding box [m], each (d,). Default: all of space."""
+        return np.full(self.dim, -np.inf), np.full(self.dim, np.inf)
 
     @abc.abstractmethod
     def middle(self) -> Float[Array, "d"]:
@@ -160,9 +160,6 @@ class HalfSpace(AbstractRegion):
         """(x − point)·normal/‖normal‖."""
         normal = jnp.asarray(self.normal, x.dtype)
         return ((x - jnp.asarray(self.point, x.dtype)) * (normal / length(normal))).sum(axis=-1)
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.full(self.dim, -np.inf), np.full(self.dim, np.inf)
 
     def middle(self) -> Float[Array, "d"]:
         return jnp.asarray(self.point)

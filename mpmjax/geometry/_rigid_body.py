@@ -15,18 +15,12 @@ error is of the order of the angle of a step, and squared by each; three would d
 class RigidBody(eqx.Module):
     """A set of particles that move as one: r = 0, 1 or 3 numbers of rotation in one, two and three dimensions."""
 
-    mass: Float[Array, ""]
-    """M [kg]."""
-    centre: Float[Array, "d"]
-    """c, the centre of mass [m]."""
-    velocity: Float[Array, "d"]
-    """V [m/s], that of the centre."""
-    spin: Float[Array, "r"]
-    """ω [rad/s]."""
-    inertia: Float[Array, "r r"]
-    """I about the centre [kg m²]."""
-    arms: ParticleVector
-    """x_p − c [m], shape (p, d)."""
+    mass: Float[Array, ""]  # M [kg]
+    centre: Float[Array, "d"]  # c, the centre of mass [m]
+    velocity: Float[Array, "d"]  # V [m/s], that of the centre
+    spin: Float[Array, "r"]  # ω [rad/s]
+    inertia: Float[Array, "r r"]  # I about the centre [kg m²]
+    arms: ParticleVector  # x_p − c [m], shape (p, d)
 
     def root(self) -> Float[Array, "r r"]:
         """G [m] with GᵀG = I/M, so that the energy ½ ω·Iω is ½ M ‖Gω‖²."""

@@ -181,8 +181,7 @@ class Cylinder(AbstractRound):
         return ends.min(axis=0) - reach, ends.max(axis=0) + reach
 
     def fitted(self, size: np.ndarray) -> Cells:
-        """Sectors of concentric rings, in slices along the axis; in 2-D the cells of the rectangle, along the axis and
-        across."""
+        """Sectors of concentric rings, in slices along the axis; in 2-D the rectangle's, along the axis and across."""
         if self.dim == 3:
             return _round_cells(self.start, self.end, 0.0, self.radius, size)
         start, end, radius = np.asarray(self.start, float), np.asarray(self.end, float), float(self.radius)

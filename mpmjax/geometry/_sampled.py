@@ -29,10 +29,8 @@ from mpmjax.geometry._region import AbstractRegion, length
 _SPLINE = BSpline(2)
 _FIRST = 0.02
 """The first distance tried by which samples are moved, in spacings, so that the region has the shape's volume."""
-_SECANTS = 4
-"""Steps of the secant method that finds this distance."""
-_ALIKE, _POOR = 1e-4, 5e-3
-"""Relative errors of the volume at which the search ends, and beyond which it is warned of."""
+_SECANTS = 4  # steps of the secant method that finds this distance
+_ALIKE, _POOR = 1e-4, 5e-3  # relative errors of the volume at which the search ends, and beyond which it is warned of
 _PADDING = 3  # samples beyond the bounding box on each side: one and a half are the spline's
 
 

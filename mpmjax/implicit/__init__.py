@@ -4,14 +4,6 @@ Choices of a method: `ConjugateResidual`, `Linearised`, `Newton`; `AnalyticHessi
 `DiagonalPreconditioner`, `MassPreconditioner`; `Guess`. The bases to derive from are called `Abstract...`.
 """
 
-from mpmjax.implicit._hessian import (
-    AbstractHessian as AbstractHessian,
-    AbstractHessianAction as AbstractHessianAction,
-    AnalyticHessian as AnalyticHessian,
-    JvpHessian as JvpHessian,
-    ParticleStiffness as ParticleStiffness,
-    TangentAction as TangentAction,
-)
 from mpmjax.implicit._newton import Newton as Newton
 from mpmjax.implicit._operator import (
     AbstractInnerProduct as AbstractInnerProduct,
@@ -22,7 +14,15 @@ from mpmjax.implicit._operator import (
     MassPreconditioner as MassPreconditioner,
     Projection as Projection,
 )
-from mpmjax.implicit._potential import ElasticPotential as ElasticPotential
+from mpmjax.implicit._potential import (
+    AbstractHessian as AbstractHessian,
+    AbstractHessianAction as AbstractHessianAction,
+    AnalyticHessian as AnalyticHessian,
+    ElasticPotential as ElasticPotential,
+    JvpHessian as JvpHessian,
+    ParticleStiffness as ParticleStiffness,
+    TangentAction as TangentAction,
+)
 from mpmjax.implicit._solve_info import (
     AbstractInnerProductSolver as AbstractInnerProductSolver,
     SolveInfo as SolveInfo,

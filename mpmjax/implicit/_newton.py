@@ -71,10 +71,8 @@ class Newton(AbstractStageSolver):
         # The velocity w = dx/(θΔt_s) strains a cell by one in the stage. Deformation gradients are of order one, and
         # rounded to ε, at the smallest strains too: with A the diagonal of the operator, ε A w is the rounding of the
         # momentum residual and ε A w² that of the potential.
-        unit, rounding_unit = (
-            problem.spacing / (problem.theta * problem.stage_dt),
-            _ROUNDING * jnp.finfo(guess.dtype).eps,
-        )
+        unit = problem.spacing / (problem.theta * problem.stage_dt)
+        rounding_unit = _ROUNDING * jnp.finfo(guess.dtype).eps
 
         def norm(r: NodeVector) -> Float[Array, ""]:
             """‖r‖ in the norm of the inverse mass."""
@@ -157,17 +155,13 @@ class Newton(AbstractStageSolver):
 
 class _Iterate(NamedTuple):
     v: NodeVector
-    r: NodeVector
-    """The residual at v."""
-    rounding: Float[Array, ""]
-    """The rounding of ‖r‖."""
-    settled: Bool[Array, ""]
-    """Whether the last Newton step was taken whole and was negligible."""
+    r: NodeVector  # the residual at v
+    rounding: Float[Array, ""]  # the rounding of ‖r‖
+    settled: Bool[Array, ""]  # whether the last Newton step was taken whole and was negligible
     iterations: Int[Array, ""]
     newton: Int[Array, ""]
     halvings: Int[Array, ""]
-    stuck: Bool[Array, ""]
-    """Whether the last line search failed."""
+    stuck: Bool[Array, ""]  # whether the last line search failed
     indefinite: Bool[Array, ""]
 
 

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.autodiff import custom_derivative
-from mpmjax.implicit._hessian import AbstractHessianAction, ParticleStiffness
-from mpmjax.implicit._potential import ElasticPotential
+from mpmjax.implicit._potential import AbstractHessianAction, ElasticPotential, ParticleStiffness
 
 _BLOCK_SIZE = 64  # as in native/vectors.h
 
@@ -207,10 +206,10 @@ class AbstractPreconditioner(eqx.Module):
 class DiagonalPreconditioner(AbstractPreconditioner):
     """M + χ diag(H) without negative parts of H. The default.
 
-    The saving depends on the scene. In bodies of halves, layers and inclusions at contrasts of 10 to 10 000, in two and
-    three dimensions, it took between an eighth and three fifths of the iterations of `MassPreconditioner` at a hundred
-    times the explicit limit, and between a third and all of them at twenty times. In homogeneous bodies it took between
-    a third of them and a fifth more.
+    The saving depends on the scene. Bodies of halves, layers and inclusions, in two and three dimensions, at contrasts
+    of 10 to 10 000 took an eighth to three fifths of the iterations of `MassPreconditioner` at a hundred times the
+    explicit limit, and a third to all of them at twenty times; homogeneous ones between a third of them and a fifth
+    more.
     """
 
     def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
@@ -249,7 +248,6 @@ def _combine(
 ) -> tuple[Array, Array, Array]:
     """Two sums of two vectors with a norm. In JAX these are some four passes over the window, of which a body may fill
     a small part; natively it is one, in place, that skips inactive blocks."""
-    del active
     return a + scales[0] * b, (z := c + scales[1] * d), (weight * z * z).sum()
 
 

@@ -1,5 +1,6 @@
 """The interface of linear solvers, and the report of a solve."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,10 +19,8 @@ class SolveInfo(eqx.Module):
 
     iterations: Int[Array, "*f"] = eqx.field(default_factory=_COUNT)
     """Iterations of the linear solver, summed over Newton steps; 0 if the solver states none."""
-    newton: Int[Array, "*f"] = eqx.field(default_factory=_COUNT)
-    """Newton steps."""
-    line_search: Int[Array, "*f"] = eqx.field(default_factory=_COUNT)
-    """Halvings of a Newton step by the line search."""
+    newton: Int[Array, "*f"] = eqx.field(default_factory=_COUNT)  # Newton steps
+    line_search: Int[Array, "*f"] = eqx.field(default_factory=_COUNT)  # halvings of a Newton step by the line search
     residual: Float[Array, "*f"] = eqx.field(kw_only=True)
     """True relative residual at the end. For one linear solve it is in the norm of the inverse preconditioner; for
     Newton's method in that of the inverse mass, and relative to the momentum of the balanced forces if their sum
@@ -37,13 +36,11 @@ class SolveInfo(eqx.Module):
 
     def followed_by(self, later: "SolveInfo") -> "SolveInfo":
         """The summed cost of two solves of one equation, and the quality of the later one."""
-        return SolveInfo(
+        return replace(
+            later,
             iterations=self.iterations + later.iterations,
             newton=self.newton + later.newton,
             line_search=self.line_search + later.line_search,
-            residual=later.residual,
-            converged=later.converged,
-            nearly_converged=later.nearly_converged,
             indefinite=self.indefinite | later.indefinite,
             report=self.report + later.report,
         )
@@ -53,8 +50,8 @@ class SolveInfo(eqx.Module):
         both = self.followed_by(other)
         converged = self.converged & other.converged
         usable = (self.converged | self.nearly_converged) & (other.converged | other.nearly_converged)
-        worst = jnp.maximum(self.residual, other.residual), converged, usable & ~converged
-        return eqx.tree_at(lambda info: (info.residual, info.converged, info.nearly_converged), both, worst)
+        worst = jnp.maximum(self.residual, other.residual)
+        return replace(both, residual=worst, converged=converged, nearly_converged=usable & ~converged)
 
 
 def no_solve(dtype: Any) -> SolveInfo:
@@ -72,11 +69,7 @@ class AbstractInnerProductSolver(lx.AbstractLinearSolver[Any]):
 
 
 def require_solver(name: str, solver: lx.AbstractLinearSolver) -> None:
-    """Check a linear solver.
-
-    Raises:
-        ValueError: an absolute tolerance that is not above zero.
-    """
+    """Check a linear solver: a ValueError if it has an absolute tolerance that is not above zero."""
     if (atol := getattr(solver, "atol", None)) is not None:
         require_that(
             f"{name} must have an atol above zero, as it compares residuals component by component and those of empty "

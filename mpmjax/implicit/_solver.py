@@ -15,7 +15,6 @@ from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
 from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
 from mpmjax.discretisation import Basis, basis_attributes, resist_sum, without_flat
-from mpmjax.implicit._hessian import ParticleStiffness
 from mpmjax.implicit._operator import (
     AbstractInnerProduct,
     DiagonalInnerProduct,
@@ -24,10 +23,10 @@ from mpmjax.implicit._operator import (
     combine_onto,
     rest_of_product,
 )
+from mpmjax.implicit._potential import ParticleStiffness
 from mpmjax.implicit._solve_info import AbstractInnerProductSolver, SolveInfo
 
-DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}
-"""The default relative tolerance, by bytes a number."""
+DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}  # the default relative tolerance, by bytes a number
 NEARLY_CONVERGED = 10.0
 """A solve that ends within this many times its tolerance is accepted, and counted as less accurate. The error is
 proportional to the residual, so seven of eight digits are left, or four of the five of float32."""
@@ -57,8 +56,7 @@ class ConjugateResidual(AbstractInnerProductSolver):
     - `num_steps`: applications of E in the recurrence.
     - `residual`: the true ‖r‖/‖W⁻¹b‖.
     - `spectral_radius`: an estimate of ‖E‖.
-    - `indefinite`: whether rᵀA r < 0 beyond rounding was met. A is then not positive definite; the converse does not
-      hold.
+    - `indefinite`: whether rᵀA r < 0 beyond rounding was met. A is then not positive definite, but not conversely.
     - `nearly_converged`: whether it did not converge, but came within ten times `rtol`.
 
     *When it breaks*: with an indefinite A the recurrence stops where rᵀA r = 0. The result is then
@@ -66,8 +64,8 @@ class ConjugateResidual(AbstractInnerProductSolver):
 
     Args:
         rtol: relative tolerance. Default: 1e-8 in float64, 1e-5 in float32; 1e-6 there as an adjoint solver.
-        increment_rtol: stop also when an increment is small, ‖α_k p_k‖² ≤ increment_rtol² ‖x‖² (the
-            alternative named after eq. 20 of the derivation). Default: not used. It says nothing of the residual.
+        increment_rtol: stop also when an increment is small, ‖α_k p_k‖² ≤ increment_rtol² ‖x‖². Default: not used. It
+            says nothing of the residual.
         max_steps: largest number of steps of the recurrence.
     """
 
@@ -279,8 +277,7 @@ def solve_particle_matrices(
 
 
 def _call_solve(call: Any, first: Array, t: Array, *args: Array, basis: Basis) -> list[Array]:
-    """By a kernel, with memory for six vectors. Members of a batch, which run one after the other in a thread, take
-    their own."""
+    """By a kernel, with memory for six vectors. Members of a batch, one after the other in a thread, take their own."""
     n, dtype = args[-2].shape[-1], t.dtype
     results = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, 9, 0 if first.ndim > 2 else 6 * n)]
     aliases = {2 + len(args) - 3: 0}

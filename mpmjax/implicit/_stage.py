@@ -17,9 +17,8 @@ import lineax as lx
 from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
 from mpmjax.autodiff import custom_derivative, saved_for_backward, without_derivative
 from mpmjax.checks import require_fields
-from mpmjax.implicit._hessian import AbstractHessian, AbstractHessianAction
 from mpmjax.implicit._operator import AbstractPreconditioner, ImplicitOperator, Projection
-from mpmjax.implicit._potential import ElasticPotential
+from mpmjax.implicit._potential import AbstractHessian, AbstractHessianAction, ElasticPotential
 from mpmjax.implicit._solve_info import SolveInfo, require_solver
 from mpmjax.implicit._solver import DEFAULT_RTOL, ConjugateResidual, solve_linear
 
@@ -128,12 +127,8 @@ class AbstractStageSolver(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
-        """The solution [m/s], shape (n, d), and the report of the solve.
-
-        Args:
-            problem: the problem.
-            guess: where an iteration starts [m/s], shape (n, d).
-        """
+        """The solution [m/s], shape (n, d), and the report of the solve; an iteration starts at the guess [m/s], shape
+        (n, d)."""
 
 
 class Linearised(AbstractStageSolver):
@@ -194,15 +189,13 @@ def solve(
     """The solution of a problem, differentiable with respect to it in forward and reverse mode, to any order.
 
     Args:
-        problem: the problem.
-        slot: that of `Reporting`.
+        problem, slot: the problem, and the slot of `Reporting`.
         guess: where the search starts [m/s], shape (n, d). Result and derivative depend on it only within the
             tolerance. No derivative passes it, nor what follows.
         method: how it is solved, as by an `AbstractStageSolver`.
         adjoint: solver of the tangent and adjoint systems. A solve that ends beyond ten times its tolerance gives NaN,
             so that a wrong gradient cannot pass for a right one.
     """
-    del slot, adjoint
     return method(problem, guess)
 
 

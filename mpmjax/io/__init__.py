@@ -7,7 +7,11 @@ from mpmjax.io._runs import load as load, record as record, save as save, table 
 from mpmjax.io._schema import (
     arguments as arguments,
     decode as decode,
+    encode as encode,
+    known_classes as known_classes,
+    parameters_of as parameters_of,
     register as register,
+    require_keys as require_keys,
 )
 from mpmjax.io._transactional_file import (
     ReplacedFile as ReplacedFile,

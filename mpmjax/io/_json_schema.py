@@ -5,10 +5,8 @@ import inspect
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, get_args, get_origin
 
-import equinox as eqx
-
 from mpmjax.checks import alternatives, is_class
-from mpmjax.io._schema import MADE, forms_of, known_classes, parameters_of
+from mpmjax.io._schema import MADE, classes_for, forms_of, known_classes, parameters_of
 
 
 def table_schema(function: Callable, without: Iterable[str] = (), kind: str | None = None) -> dict[str, Any]:
@@ -23,10 +21,12 @@ def table_schema(function: Callable, without: Iterable[str] = (), kind: str | No
     return table | {"description": text, "required": required}
 
 
-def class_schemas() -> dict[str, Any]:
-    """The JSON schema of each class that files can hold, and of what else has a kind, by name."""
+def class_schemas(*bases: type) -> dict[str, Any]:
+    """The JSON schema of each class that files can hold, of those of further base classes, and of what else has a
+    kind, by name."""
+    classes = {c.__name__: c for c in (*known_classes(), *classes_for(bases))}
     made = {name: make for name, (make, _) in MADE.items()}
-    return {name: table_schema(c, kind=name) for name, c in ({c.__name__: c for c in known_classes()} | made).items()}
+    return {name: table_schema(c, kind=name) for name, c in (classes | made).items()}
 
 
 def _value_schema(hint: Any) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def _value_schema(hint: Any) -> dict[str, Any]:
         for _ in range(depth):
             value = {"type": "array", "items": value}
         choices.append(value)
-    for cls in [c for c in known_classes() if any(is_class(a, eqx.Module) and issubclass(c, a) for a in options)]:
+    for cls in classes_for(options):
         choices.append({"$ref": f"#/$defs/{cls.__name__}"})
         if all(default is not inspect.Parameter.empty for _, default in parameters_of(cls).values()):
             choices.append({"const": cls.__name__})  # its kind alone

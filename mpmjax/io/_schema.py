@@ -50,18 +50,15 @@ def register(cls: Registered) -> Registered:
     arguments. So each argument must be a field of the same name, annotated with what files can hold: float, int, bool,
     str, an array, an enumeration, an equinox module whose class is the package's, of `equinox.nn` or registered, a
     function of `jax.nn` or a compiled one of `jax.numpy`, or tuples of such. So a law may hold a network,
-    `network: eqx.nn.MLP`; a run's file has its weights, a scene file cannot.
-    Numbers in files are finite; a corner of a box that may have no end is annotated as `mpmjax.geometry.Corner`.
+    `network: eqx.nn.MLP`; a run's file has its weights, a scene file cannot. Numbers in files are finite; a corner of a
+    box that may have no end is annotated as `mpmjax.geometry.Corner`.
 
     A file names classes and never executes code: import the module that registers a class before reading a file with
     one, in the shell by `mpmjax run SCENE.toml --import MODULE`. A class that is defined anew, as in a notebook, takes
     the place of the one before.
 
     Args:
-        cls: an `equinox.Module`, such as a law, a boundary, a body force or a region.
-
-    Returns:
-        The class.
+        cls: an `equinox.Module`, such as a law, a boundary, a body force or a region; it is returned.
 
     Raises:
         ValueError: no such class, a name that another class has, or an argument that files cannot hold.
@@ -95,7 +92,6 @@ def saved_classes() -> tuple[type, ...]:
 
 
 def _mesh(file: str, spacing: Scalar, scale: Scalar = 1.0) -> SampledDistance:
-    """The region within a mesh in a file, see `sample_mesh`."""
     return sample_mesh(file, float(spacing), scale=float(scale))
 
 
@@ -108,9 +104,15 @@ def known_classes() -> tuple[type, ...]:
     return (*saved_classes(), *_registered.values())
 
 
-def _can_be_held(hint: Any) -> bool:
-    """Whether some value of an annotation can stand in a file."""
+def classes_for(options: Iterable[Any]) -> list[type]:
+    """The classes of an annotation's members that files can hold; of bases that no scene has, all public ones."""
+    taken = tuple(a for a in options if is_class(a, eqx.Module))
+    held = [c for c in known_classes() if issubclass(c, taken)]
+    others = [c for a in taken if is_abstract(a) for c in choices(a).values() if is_own(c)]
+    return sorted(held or others, key=lambda c: c.__name__)
 
+
+def _can_be_held(hint: Any) -> bool:
     def can(a: Any) -> bool:
         if is_class(a, eqx.Module):  # a class of one's own is made of its fields
             return is_abstract(a) or _is_network(a) or set(parameters_of(a)) <= {f.name for f in fields(a)}
@@ -191,8 +193,7 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         options = [eqx.Module]
     if isinstance(data, dict) and str(data.get("kind")).startswith("equinox.nn."):
         return _network(data, options, where, arrays)
-    fitting = [c for c in known_classes() if any(is_class(a, eqx.Module) and issubclass(c, a) for a in options)]
-    fitting.sort(key=lambda c: c.__name__)
+    fitting = classes_for(options)
     classes: dict[str, Callable[..., Any]] = {c.__name__: c for c in fitting}
     if arrays is None:  # a file that a person writes
         classes |= {name: make for name, (make, cls) in MADE.items() if cls.__name__ in classes}
@@ -295,12 +296,7 @@ def arguments(
     has otherwise."""
     _require(isinstance(table, dict), where, f"must be a table, got {_short(table)}")
     parameters = {name: p for name, p in parameters_of(function).items() if name not in without}
-    for key in table:
-        if key not in parameters:
-            hint = _close(key[:60], parameters)
-            raise ValueError(
-                f"{_named(where, 'unknown key')} {_short(key)}{hint} Known here: {', '.join(parameters) or 'none'}."
-            )
+    require_keys(table, parameters, where)
     for name, (_, default) in parameters.items():
         _require(name in table or default is not inspect.Parameter.empty, where, f"needs the key {name!r}")
 
@@ -311,6 +307,13 @@ def arguments(
         return f"{where[:-1]}.{key}]" if where.endswith("]") else f"{where} [{key}]".strip()
 
     return {key: decode(value, parameters[key][0], inside(key, value), arrays) for key, value in table.items()}
+
+
+def require_keys(table: dict[str, Any], names: Iterable[str], where: str) -> None:
+    """Check that a table in a file has no other keys than these."""
+    for key in (key for key in table if key not in names):
+        named = f"{_named(where, 'unknown key')} {_short(key)}{_close(key[:60], names)}"
+        raise ValueError(f"{named} Known here: {', '.join(names) or 'none'}.")
 
 
 def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray] | None) -> Any:
@@ -339,15 +342,12 @@ def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray]
 
 
 def _plain(data: Any) -> Any:
-    """Nested lists as tuples."""
     return tuple(map(_plain, data)) if isinstance(data, list) else data
 
 
 def parameters_of(function: Callable) -> dict[str, tuple[Any, Any]]:
-    """Annotation and default of each argument of a function or constructor.
-
-    Where a field has a converter, equinox says `Any` of the argument, and the field itself says more.
-    """
+    """Annotation and default of each argument of a function or constructor. Where a field has a converter, equinox says
+    `Any` of the argument, and the field itself says more."""
     of_class = isinstance(function, type)
     signature = inspect.signature(function.__init__ if of_class else function)
     types = _field_types(function) if of_class else {}
@@ -386,8 +386,6 @@ def forms_of(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
 
 
 def _words(forms: set[tuple[type, int]]) -> str:
-    """The forms in words."""
-
     def words(kind: type, depth: int) -> str:
         lists = " ".join(["a list of", *["lists of"] * (depth - 1)])
         return _ONE[kind] if depth == 0 else f"{lists} {_MANY[kind]}"

@@ -33,5 +33,7 @@ from mpmjax.linalg._matrices import (
 from mpmjax.linalg._spectral import (
     AbstractSpectral as AbstractSpectral,
     Logarithm as Logarithm,
+    PowerBeyondLine as PowerBeyondLine,
     PowerLessOne as PowerLessOne,
+    exponential_beyond_line as exponential_beyond_line,
 )

@@ -36,6 +36,8 @@ Frame = tuple[Array, Matrix]
 _CLOSE = 0.01
 """Relative to the sum of the outer two: the divided difference of three or more eigenvalues closer than this is a
 series. Elsewhere it is a quotient of differences, with an error of rounding over this."""
+_SMALL, _LAST = 0.3, 14
+"""Where the exponential is a series, and its last power: the remainder is below 1e-16 of it."""
 _TERMS = 6
 """Terms of the series after the first; the remainder is of the order 1e-12."""
 
@@ -109,6 +111,28 @@ class PowerLessOne(AbstractSpectral):
 
     def _power(self, s: Array) -> Array:
         return jnp.exp(self.exponent * jnp.log(s) + self.shift)
+
+
+class PowerBeyondLine(PowerLessOne):
+    """eᶜ Sᵃ − I − (a ln S + c I), of second order in a and c, and of full relative precision where they are small."""
+
+    def of(self, s: Array) -> Array:
+        """exp(y) − 1 − y, y = a ln s + c."""
+        return exponential_beyond_line(self.exponent * jnp.log(s) + self.shift)
+
+    def slope(self, a: Array, b: Array) -> Array:
+        return super().slope(a, b) - self.exponent * Logarithm().slope(a, b)
+
+    def coefficient(self, s: Array, order: int) -> Array:
+        return super().coefficient(s, order) - self.exponent * Logarithm().coefficient(s, order)
+
+
+def exponential_beyond_line(y: Array) -> Array:
+    """exp(y) − 1 − y, to rounding: a series where y is small."""
+    small = jnp.abs(y) < _SMALL
+    x = jnp.where(small, y, 0)
+    series = reduce(lambda rest, k: 1 + x / k * rest, range(_LAST, 2, -1), jnp.ones_like(x))
+    return jnp.where(small, x**2 / 2 * series, jnp.expm1(y) - y)
 
 
 class _Partial(AbstractSpectral):

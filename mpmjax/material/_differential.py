@@ -34,15 +34,13 @@ class AbstractDifferential(eqx.Module):
         """The upper triangle of the symmetric matrix of G ↦ w (∂²Ψ/∂F∂F : (G A)) Aᵀ, row by row, in closed form, shape
         (d²(d² + 1)/2, *p). Rows and columns are the components G_ab, b before a. Default: None, and the map is applied
         to the d² unit matrices instead, which takes several times as long. It is never differentiated."""
-        del A, weight
         return None
 
 
 class MatrixDifferential(AbstractDifferential):
     """The stress differential as a d² x d² matrix for each particle."""
 
-    matrix: Float[Array, "m m *p"]
-    """∂²Ψ/∂F∂F [Pa], on the d² components of δF in C order, shape (d², d², *p)."""
+    matrix: Float[Array, "m m *p"]  # ∂²Ψ/∂F∂F [Pa], on the d² components of δF in C order, shape (d², d², *p)
 
     def __call__(self, dF: Matrix) -> Matrix:
         return la.matmul(self.matrix, dF.reshape(-1, 1, *dF.shape[2:])).reshape(dF.shape)
@@ -51,8 +49,7 @@ class MatrixDifferential(AbstractDifferential):
 class VolumetricDifferential(AbstractDifferential):
     """The stress differential of a law of J alone: δJ ↦ d²Ψ/dJ² δJ."""
 
-    stiffness: Float[Array, "*p"]
-    """d²Ψ/dJ² [Pa], shape (p,)."""
+    stiffness: Float[Array, "*p"]  # d²Ψ/dJ² [Pa], shape (p,)
 
     def __call__(self, dF: Array) -> Array:
         return self.stiffness * dF
@@ -67,12 +64,9 @@ class PrincipalDifferential(eqx.Module):
     """
 
     twist: Float[Array, "c *p"]
-    """(∂Ψ/∂s_i + ∂Ψ/∂s_j)/(s_i + s_j) [Pa] for the pairs i < j, in the order (0, 1), (0, 2), (1, 2), shape
-    (d (d − 1)/2, *p)."""
-    flip: Float[Array, "c *p"]
-    """(∂Ψ/∂s_i − ∂Ψ/∂s_j)/(s_i − s_j) [Pa] for the same pairs."""
-    scaling: Matrix
-    """∂²Ψ/∂s_i∂s_j [Pa], shape (d, d, *p)."""
+    """(∂Ψ/∂s_i + ∂Ψ/∂s_j)/(s_i + s_j) [Pa] for the pairs i < j, (0, 1), (0, 2), (1, 2), shape (d (d − 1)/2, *p)."""
+    flip: Float[Array, "c *p"]  # (∂Ψ/∂s_i − ∂Ψ/∂s_j)/(s_i − s_j) [Pa] for the same pairs
+    scaling: Matrix  # ∂²Ψ/∂s_i∂s_j [Pa], shape (d, d, *p)
 
     @classmethod
     def of(
@@ -82,8 +76,7 @@ class PrincipalDifferential(eqx.Module):
         flip: Callable[[int, int], Array],
         scaling: Callable[[int, int], Array],
     ) -> "PrincipalDifferential":
-        """From functions of the indices i, j at signed principal stretches s [-]: twist and flip of each pair i < j,
-        and each entry of the scaling [Pa]."""
+        """From functions of i and j at signed principal stretches s [-]: twist and flip if i < j, scaling [Pa]."""
         d, none = s.shape[0], jnp.zeros((0, *s.shape[1:]), s.dtype)
 
         def over_pairs(entry: Callable[[int, int], Array]) -> Array:
@@ -114,8 +107,7 @@ class PrincipalDifferential(eqx.Module):
 class IsotropicDifferential(AbstractDifferential):
     """The stress differential as the derivative of an isotropic law's stress."""
 
-    law: Any
-    """A law of F with `stress` and a closed form of `principal_differential`."""
+    law: Any  # a law of F with `stress` and a closed form of `principal_differential`
     F: Matrix
 
     def __call__(self, dF: Matrix) -> Matrix:
@@ -124,7 +116,6 @@ class IsotropicDifferential(AbstractDifferential):
     def pushed_forward(self, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"]:
         """By the law's `principal_differential`. With F = U diag(s) Vᵀ and R = A V, and of the eigenstructure the
         scaling S_ij and for each pair h and g, half the sum of flip and twist and half their difference, the matrix is
-
             K_(ba)(dc) = w (Σ_ij S_ij U_ai R_bi U_cj R_dj + Σ_i≠j U_ai R_bj (h_ij U_ci R_dj + g_ij U_cj R_di)).
         """
         d, (U, s, V) = len(A), la.principal_frame(self.F)
@@ -210,10 +201,8 @@ def _in_modes(modes: Float[Array, "m m *p"], core: Float[Array, "m m *p"]) -> Fl
 
 
 def is_isotropic(law: Any, like: Matrix) -> Bool[Array, "*p"]:
-    """Whether a law's energy does not change as the material is rotated before a deformation, or space after it: at one
-    deformation, so that the answer is that of the law's parameters. True where the energy is not finite. Of F only the
-    shape counts.
-    """
+    """Whether rotations of the material before a deformation, and of space after it, leave a law's energy as it is: at
+    one deformation of F's shape, so that the answer is that of the law's parameters. True where it is not finite."""
     d = len(like)
     if d == 1:
         return jnp.ones(like.shape[2:], bool)

@@ -15,10 +15,8 @@ from mpmjax.material._law import AbstractMaterial
 class AbstractIsotropic(AbstractMaterial):
     """A law given by Young's modulus and Poisson's ratio: at small strains δP = 2μ ε + λ tr(ε) I."""
 
-    youngs_modulus: PerParticle
-    """E [Pa]."""
-    poisson_ratio: PerParticle
-    """ν [-]."""
+    youngs_modulus: PerParticle  # E [Pa]
+    poisson_ratio: PerParticle  # ν [-]
 
     def __check_init__(self):
         require_fields(self)
@@ -44,8 +42,7 @@ class FixedCorotated(AbstractIsotropic):
     """Fixed corotated elasticity (A. Stomakhin, R. Howes, C. Schroeder, J. Teran, SCA 2012, doi
     10.2312/SCA/SCA12/025-032).
 
-    Ψ = μ ‖F − R‖² + λ/2 (J − 1)², P = 2μ (F − R) + λ (J − 1) J F⁻ᵀ, with F = R S and J = det F; its differential
-    is eq. 11 of the derivation.
+    Ψ = μ ‖F − R‖² + λ/2 (J − 1)², P = 2μ (F − R) + λ (J − 1) J F⁻ᵀ, F = R S, J = det F (derivation, eq. 11).
 
     *When it breaks*: not by inversion, since it is defined for every F, J ≤ 0 included. In 2-D and 3-D its Hessian is
     indefinite under any uniform compression, and the stress differential grows like 1/(s_i + s_j) where two signed
@@ -66,10 +63,6 @@ class FixedCorotated(AbstractIsotropic):
         volumetric = self.lame_lambda * (la.determinant(F) - 1)
         return 2 * self.shear_modulus * (F - la.rotation(F)) + volumetric * la.cofactor(F)
 
-    def stress_differential(self, F: Matrix) -> IsotropicDifferential:
-        """δP = 2μ (δF − δR) + λ (J F⁻ᵀ : δF) J F⁻ᵀ + λ (J − 1) δ(J F⁻ᵀ) (derivation, eq. 11)."""
-        return IsotropicDifferential(self, F)
-
     def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
         """With v = λ (J − 1) J/(s_i s_j): twist 2μ (1 − 2/(s_i + s_j)) + v, flip 2μ − v, scaling
         2μ δ_ij + λ (J/s_i)(J/s_j) + (1 − δ_ij) v."""
@@ -86,9 +79,8 @@ class NeoHookean(AbstractIsotropic):
 
     Ψ = μ/2 (F : F − d) − μ ln J + λ/2 (ln J)², P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ.
 
-    *When it breaks*: it needs J > 0; a step that inverts a particle is reported. Its Hessian can be indefinite under
-    compression, and under even expansion once λ ln J > μ (1 + J^{2/d}): in 2-D never at ν = 0.3, and from J = 1.04 on
-    at ν = 0.49.
+    *When it breaks*: it needs J > 0; inversion is reported. Its Hessian can be indefinite under compression, and under
+    even expansion once λ ln J > μ (1 + J^{2/d}): in 2-D never at ν = 0.3, and from J = 1.04 on at ν = 0.49.
     *Good values*: rubber μ = 0.1 to 2 MPa with ν = 0.49 (nearly incompressible), gels as for fixed corotated.
 
     Args:

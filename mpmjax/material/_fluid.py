@@ -41,7 +41,6 @@ class AbstractVolumetric(AbstractMaterial):
 
     def stiffness_eigenvalues(self, J: Array, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
         """The one of d/dJ(JΨ') J tr(L) I that is not zero, d times the factor."""
-        del total
         return dim * (self.stress_differential(J).stiffness * J * J + J * self.stress(J))[None]
 
 
@@ -50,16 +49,10 @@ class Tait(AbstractVolumetric):
     doi 10.1073/pnas.30.9.244): p = −dΨ/dJ = K/γ (J^−γ − 1), a bulk modulus that rises by γ p.
 
     Ψ = K/γ (J − 1 + (J^{1−γ} − 1)/(γ − 1)), for γ = 1 K (J − 1 − ln J): zero at rest, and convex for every J > 0.
-    Without `tension` Ψ is zero beyond J = 1; derivatives at J = 1 are those of compression.
+    Without `tension` Ψ is zero beyond J = 1; derivatives at J = 1 are those of compression. There is tension by
+    default, unlike in `Fluid`, whose return map undoes expansion and whose parameters these are.
 
     *When it breaks*: it needs J > 0; a step that makes a particle's volume negative is reported.
-    *Good values*: see `Fluid`.
-
-    Args:
-        bulk_modulus: K [Pa] at rest, one value or one per particle (p,).
-        exponent: γ [-], positive.
-        tension: whether the pressure may be below zero. It may by default, unlike that of `Fluid`, whose return map
-            undoes expansion.
     """
 
     bulk_modulus: PerParticle
@@ -124,17 +117,13 @@ class Fluid(AbstractInelastic):
         require_positive("Fluid's exponent", self.exponent)
 
     def initial_history(self, J: Array, /) -> None:
-        """None."""
         del J
 
     def elastic(self, history: None) -> Tait:
-        """The equation of state."""
-        del history
         return Tait(self.bulk_modulus, self.exponent, self.tension)
 
     def return_map(self, J: Array, history: None, dt: Scalar, /) -> tuple[Array, None]:
         """min(J, 1); with tension J."""
-        del dt
         return J if self.tension else _pressed(J), history
 
 

@@ -21,8 +21,7 @@ class DruckerPragerHistory(eqx.Module):
 
     gap: Float[Array, "*p"]
     """v_c [-], the logarithmic volume by which it has come apart and not closed again, at least zero, shape (p,)."""
-    transverse_strain: Float[Array, "*p"] | None
-    """ε_t [-] (see `Hencky`), shape (p,); None in 3-D."""
+    transverse_strain: Float[Array, "*p"] | None  # ε_t [-] (see `Hencky`), shape (p,); None in 3-D
 
 
 class DruckerPrager(AbstractHenckyPlasticity):
@@ -90,8 +89,7 @@ class CamClayHistory(eqx.Module):
 
     volume_strain: Float[Array, "*p"]
     """α [-], the plastic logarithmic change of volume, shape (p,). It sets the strength: negative where compacted."""
-    transverse_strain: Float[Array, "*p"] | None
-    """ε_t [-] (see `Hencky`), shape (p,); None in 3-D."""
+    transverse_strain: Float[Array, "*p"] | None  # ε_t [-] (see `Hencky`), shape (p,); None in 3-D
 
 
 class CamClay(AbstractHenckyPlasticity):
@@ -198,10 +196,9 @@ class Snow(AbstractInelastic):
     the plane, where the stretch is one.
 
     *When it breaks*: it needs J > 0. Where hardening outruns yielding a return map creates energy: keep ξ J_P θ_c well
-    below 2/d. The table's 0.25 is enough for packed snow; torn snow that is pressed again gains a little energy, but it
-    is soft and holds little. The moduli grow without bound under compression, by a factor e at J_P = 1 − 1/ξ, and the
-    explicit step shrinks with them: take semi-implicit steps for packed snow. The return map's derivative jumps where
-    yielding begins.
+    below 2/d. The table's 0.25 is enough for packed snow; torn snow that is pressed again gains little, being soft.
+    The moduli grow without bound under compression, by a factor e at J_P = 1 − 1/ξ, and the explicit step shrinks with
+    them: take semi-implicit steps for packed snow. The return map's derivative jumps where yielding begins.
     *Good values* (the paper's table): E = 1.4e5 Pa, ν = 0.2, θ_c = 2.5e-2, θ_s = 7.5e-3, ξ = 10, density 400 kg/m³.
     A smaller θ_c or θ_s makes powder of chunks, a larger ξ and E ice.
 
@@ -249,8 +246,7 @@ class Snow(AbstractInelastic):
         return clamped, SnowHistory(history.plastic_volume * yielded)
 
 
-_DUST = -60.0
-"""The smallest exponent of hardening, which gives a modulus of 1e-26 E."""
+_DUST = -60.0  # the smallest exponent of hardening, which gives a modulus of 1e-26 E
 
 
 class SnowElasticity(FixedCorotated):
@@ -262,8 +258,7 @@ class SnowElasticity(FixedCorotated):
 
 
 class _Clamp(AbstractSpectral):
-    """clamp(√c)/√c − 1 of c = s², so that F (I + f(FᵀF)) has the stretches of F, clamped. Exactly zero within the
-    limits."""
+    """clamp(√c)/√c − 1 of c = s², so that F (I + f(FᵀF)) has the stretches of F, clamped. Zero within the limits."""
 
     least: Array
     most: Array

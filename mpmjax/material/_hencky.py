@@ -13,7 +13,7 @@ from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
 from mpmjax.linalg import Logarithm, PowerLessOne
-from mpmjax.material._differential import IsotropicDifferential, PrincipalDifferential
+from mpmjax.material._differential import PrincipalDifferential
 from mpmjax.material._elastic import AbstractIsotropic
 from mpmjax.material._law import AbstractInelastic
 
@@ -62,9 +62,6 @@ class Hencky(AbstractIsotropic):
         dilation = self._dilation(la.trace(strain), F)
         kirchhoff = 2 * self.shear_modulus * strain + self.lame_lambda * dilation * la.identity_like(F)
         return la.matmul(la.cofactor(F), kirchhoff) / la.determinant(F)
-
-    def stress_differential(self, F: Matrix) -> IsotropicDifferential:
-        return IsotropicDifferential(self, F)
 
     def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
         """With τ_i = 2μ ln s_i + λ (ln J + (3 − d) ε_t) and ∂τ_i/∂ln s_j = 2μ δ_ij + λ."""
@@ -164,16 +161,14 @@ class VonMisesHistory(eqx.Module):
 
     plastic_strain: Float[Array, "*p"]
     """α [-], the accumulated equivalent plastic strain ∫ √(2/3) ‖d_p‖ dt, shape (p,); of pastes ∫ γ̇/√3 dt."""
-    transverse_strain: Float[Array, "*p"] | None
-    """ε_t [-] (see `Hencky`), shape (p,); None in 3-D."""
+    transverse_strain: Float[Array, "*p"] | None  # ε_t [-] (see `Hencky`), shape (p,); None in 3-D
 
 
 class VonMises(AbstractHenckyPlasticity):
     """Von Mises' plasticity with linear isotropic hardening, at large strains (J. C. Simo, Comput. Methods Appl. Mech.
     Eng. 99 (1992) 61, doi 10.1016/0045-7825(92)90123-2).
 
-    Elastic as Hencky's law, with Kirchhoff stress s = 2μ e in the deviator e of the elastic logarithmic strain. It
-    yields at
+    Elastic as Hencky's law, with Kirchhoff stress s = 2μ e in the deviator e of the elastic logarithmic strain. Yield:
 
         ‖s‖ = √(2/3) (σ_y + H α),
 
@@ -286,8 +281,7 @@ class HerschelBulkley(AbstractHenckyPlasticity):
         return ratio, mean, history.plastic_strain + relaxed / (3**0.5 * stiffness)
 
 
-_NEWTON_STEPS = 8
-"""Enough for 1e-15 at exponents from 0.1 to 4."""
+_NEWTON_STEPS = 8  # enough for 1e-15 at exponents from 0.1 to 4
 
 
 @custom_derivative

@@ -13,6 +13,7 @@ from mpmjax._types import Array, Bool, Deformation, Float, Matrix, PerParticle, 
 from mpmjax.checks import require
 from mpmjax.material._differential import (
     AbstractDifferential,
+    IsotropicDifferential,
     MatrixDifferential,
     PrincipalDifferential,
     is_isotropic,
@@ -24,15 +25,11 @@ class DeformationMeasure(NamedTuple):
     """The measure of deformation that a law's particles store, and how the motion of the grid changes it: the
     deformation gradient F or its elastic part [-], shape (d, d, p), or J = det F [-] alone, shape (p,)."""
 
-    axes: int
-    """How many axes one particle's deformation has: 2 of F, none of J."""
-    symbol: str
-    """In messages, what is stored; `name` says what it is."""
+    axes: int  # how many axes one particle's deformation has: 2 of F, none of J
+    symbol: str  # in messages, what is stored; `name` says what it is
     name: str  # in messages, what the symbol stands for
-    volume: str
-    """In messages, what most laws need to be positive."""
-    rate: str
-    """In messages, the rate [1/s] whose product with a step must be below 1."""
+    volume: str  # in messages, what most laws need to be positive
+    rate: str  # in messages, the rate [1/s] whose product with a step must be below 1
 
     def undeformed(self, dim: int) -> np.ndarray:
         """The deformation of one particle at rest [-], of one particle's shape."""
@@ -73,10 +70,8 @@ VOLUME_RATIO = DeformationMeasure(0, "J", "volume", "J", "|div v|")
 class Viscosity(eqx.Module):
     """A Newtonian viscous stress, linear in the velocity gradient L = ∇_x v."""
 
-    shear: PerParticle
-    """η [Pa s]."""
-    bulk: PerParticle
-    """ζ [Pa s]."""
+    shear: PerParticle  # η [Pa s]
+    bulk: PerParticle  # ζ [Pa s]
 
     def stress(self, L: Matrix) -> Matrix:
         """σ_v = 2η dev D + ζ tr(D) I [Pa], D = ½ (L + Lᵀ), dev D = D − ⅓ tr(D) I in every dimension."""
@@ -151,7 +146,6 @@ class AbstractLaw(eqx.Module):
     def compaction(self, history: Any, /) -> Float[Array, "p"] | float:
         """The volume that yielding has left [-], at most 1, shape (p,), where the deformation that is stored is the
         elastic part. Default: 1, of flow that keeps the volume."""
-        del history
         return 1.0
 
     def remembers(self, history: Any, stored: Array, /) -> bool:
@@ -219,8 +213,10 @@ class AbstractMaterial(AbstractLaw):
         return jax.grad(lambda F: _density(self, F).sum())(F)
 
     def stress_differential(self, F: Matrix, /) -> AbstractDifferential:
-        """The stress differential ∂²Ψ/∂F∂F at F, a symmetric map. Default: its matrix, by the derivative of the stress
-        in each of the d² directions."""
+        """The stress differential ∂²Ψ/∂F∂F at F, a symmetric map. Default: the derivative of the stress, of a law with
+        a closed form of `principal_differential` in one direction at a time, else in each of d² as a matrix."""
+        if type(self).principal_differential is not AbstractMaterial.principal_differential:
+            return IsotropicDifferential(self, F)
         return MatrixDifferential(la.matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
 
     def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
@@ -232,8 +228,7 @@ class AbstractMaterial(AbstractLaw):
 
         *When it breaks*: an anisotropic law has no such eigenstructure. Where a rotation of the material changes the
         energy, by a ten-thousandth of itself or more at one deformation that keeps the volume, the default is NaN, and
-        `stable_dt` and the projected Hessian refuse the law. Give such a law its step as a number, and
-        `AnalyticHessian()` or `JvpHessian()`.
+        `stable_dt` and the projected Hessian refuse the law. Give it a step as a number and `AnalyticHessian()`.
 
         Args:
             s: signed principal stretches [-], shape (d, *p).
@@ -258,8 +253,7 @@ class AbstractMaterial(AbstractLaw):
 
         *When it breaks*: the law must be isotropic; where it has no `principal_differential` of its own and is not, a
         `RuntimeError` says so. Second derivatives are refused. Where an eigenvalue is zero the map has a kink; the
-        derivative given is the mean of the two sides, which is what a central difference tends to. At F = I that is
-        so: all twists are zero.
+        derivative is the mean of both sides, that of a central difference. At F = I all twists are zero.
         """
         if type(self).principal_differential is AbstractMaterial.principal_differential:
             name = type(self).__name__
@@ -310,25 +304,18 @@ class AbstractMaterial(AbstractLaw):
         return jnp.isfinite(_density(self, F))
 
     def initial_history(self, F: Deformation, /) -> None:
-        """None."""
         del F
 
     def elastic(self, history: None) -> "AbstractMaterial":
-        """The law itself."""
-        del history
         return self
 
     def return_map(self, F: Deformation, history: None, dt: Scalar, /) -> tuple[Deformation, None]:
-        """The deformation as it is."""
-        del dt
         return F, history
 
     def inadmissible(self, or_else: str) -> tuple[str, str]:
         what, remedy = super().inadmissible(or_else)
-        return (
-            what,
-            f"Reduce dt{or_else}, or use FixedCorotated, which allows inversion." if self.measure.axes else remedy,
-        )
+        instead = f"Reduce dt{or_else}, or use FixedCorotated, which allows inversion."
+        return what, instead if self.measure.axes else remedy
 
 
 def _density(law: AbstractMaterial, F: Deformation) -> Array:

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import as_plain, require, require_fields, require_finite, require_positive, require_that
-from mpmjax.linalg import PowerLessOne
-from mpmjax.material._differential import IsotropicDifferential, PrincipalDifferential
+from mpmjax.linalg import PowerBeyondLine, PowerLessOne, exponential_beyond_line
+from mpmjax.material._differential import PrincipalDifferential
 from mpmjax.material._law import AbstractMaterial
 
 
@@ -23,13 +23,11 @@ class AbstractRubber(AbstractMaterial):
     Ψ = Σ_k w_k(E_k) + K/4 (J² − 1 − 2 ln J), where E_k = λ̄_1^α + λ̄_2^α + λ̄_3^α − 3 of an exponent α = α_k, with the
     isochoric stretches λ̄_i = J^−1/3 λ_i. Laws give the exponents and functions w_k.
 
-    P = F⁻ᵀ S with S = Σ_k w_k' α (C̄^{α/2} − (1 + E_k/3) I) + K/2 (J² − 1) I. In two dimensions and in one the stretches
-    normal to F are one: plane and uniaxial strain, of the same K. At small strains the law is Hooke's, with K and
-    μ = ½ Σ_k w_k'(0) α².
+    P = F⁻ᵀ S with S = Σ_k w_k' α (C̄^{α/2} − (1 + E_k/3) I) + K/2 (J² − 1) I. In fewer dimensions the stretches normal
+    to F are one: plane and uniaxial strain. At small strains the law is Hooke's, with K and μ = ½ Σ_k w_k'(0) α².
     """
 
-    bulk_modulus: eqx.AbstractVar[PerParticle]
-    """K [Pa]."""
+    bulk_modulus: eqx.AbstractVar[PerParticle]  # K [Pa]
 
     @abc.abstractmethod
     def powers(self) -> tuple[PerParticle, ...]:
@@ -41,7 +39,7 @@ class AbstractRubber(AbstractMaterial):
 
     def energy(self, F: Matrix) -> Array:
         J = la.determinant(F)
-        _, excess = self._strains(F, jnp.log(J))
+        excess = tuple(_second_order(a, F, jnp.log(J)) for a in self.powers())
         volumetric = self.bulk_modulus / 4 * (J**2 - 1 - 2 * jnp.log(J))
         return sum(self.work(excess), volumetric)
 
@@ -52,9 +50,6 @@ class AbstractRubber(AbstractMaterial):
         for exponent, strain, E, slope in zip(self.powers(), strains, excess, self._slopes(excess), strict=True):
             S = S + exponent * slope * (strain - E / 3 * identity)
         return la.matmul(la.cofactor(F), S) / J
-
-    def stress_differential(self, F: Matrix) -> IsotropicDifferential:
-        return IsotropicDifferential(self, F)
 
     def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
         """With p_i = λ̄_i^α − 1 and e_i = p_i − E/3: τ_i = Σ_k w' α e_i + K/2 (J² − 1),
@@ -112,18 +107,24 @@ def _excess(exponent: PerParticle, trace: Array, log_J: Array, dim: int) -> Arra
     return trace + (3 - dim) * jnp.expm1(-exponent / 3 * log_J)
 
 
+def _second_order(exponent: PerParticle, F: Matrix, log_J: Array) -> Array:
+    """E as of `_excess`, where α ln λ̄_i are left out, whose sum is zero: of full precision where α is near zero."""
+    if isinstance(exponent, int):
+        return _excess(exponent, la.trace(_isochoric_power(exponent, F, log_J)), log_J, len(F))
+    exponent = exponent * jnp.ones_like(log_J)
+    power = PowerBeyondLine(exponent / 2, -exponent / 3 * log_J)
+    return la.trace(power(la.matmul(la.transpose(F), F))) + (3 - len(F)) * exponential_beyond_line(power.shift)
+
+
 class MooneyRivlin(AbstractRubber):
     """Mooney-Rivlin rubber (M. Mooney, J. Appl. Phys. 11 (1940) 582, doi 10.1063/1.1712836; R. S. Rivlin, Phil. Trans.
     R. Soc. A 241 (1948) 379, doi 10.1098/rsta.1948.0024).
 
-    Ψ = C1 (Ī1 − 3) + C2 (Ī2 − 3) + K/4 (J² − 1 − 2 ln J), μ = 2 (C1 + C2). With C2 = 0 it is the neo-Hookean law with
-    its volume apart.
+    Ψ = C1 (Ī1 − 3) + C2 (Ī2 − 3) + K/4 (J² − 1 − 2 ln J), μ = 2 (C1 + C2). C2 = 0 is neo-Hookean, the volume apart.
 
     *When it breaks*: it needs J > 0. It follows a tension test to a stretch of about 2 or 3: it has no upturn, and
-    overestimates equibiaxial tension with the C2 of a uniaxial test alone. With C2 < 0 it loses stability at some
-    stretch.
-    *Good values*: soft rubber C1 = 0.1 to 0.3 MPa and C2 = 0 to C1, K = 2 GPa; K of 100 to 1000 μ where pressures are
-    far below K.
+    overestimates equibiaxial tension with the C2 of a uniaxial test alone. With C2 < 0 it is unstable at some stretch.
+    *Good values*: soft rubber C1 = 0.1 to 0.3 MPa and C2 = 0 to C1, K = 2 GPa; 100 to 1000 μ at pressures far below it.
 
     Args:
         c1: C1 [Pa], one value or one per particle (p,).
@@ -202,9 +203,8 @@ class Gent(AbstractRubber):
 
     Ψ = −μ J_m/2 ln(1 − (Ī1 − 3)/J_m) + K/4 (J² − 1 − 2 ln J).
 
-    *When it breaks*: it needs J > 0 and Ī1 − 3 < J_m; a step that takes a particle beyond is reported, and a fit does
-    not take parameters at which that happens. Near the limit it stiffens without bound, and steps must shrink. It knows
-    Ī1 alone, as `Yeoh` does.
+    *When it breaks*: it needs J > 0 and Ī1 − 3 < J_m; what lies beyond is reported, and refused by fits. Near the limit
+    it stiffens without bound, and steps must shrink. It knows Ī1 alone, as `Yeoh` does.
     *Good values*: J_m = 30 to 100 for rubber, below 3 for tissue; μ = 0.2 to 2 MPa; K as for `MooneyRivlin`.
 
     Args:
@@ -246,10 +246,9 @@ class Ogden(AbstractRubber):
 
     Ψ = Σ_k μ_k/α_k (λ̄_1^α_k + λ̄_2^α_k + λ̄_3^α_k − 3) + K/4 (J² − 1 − 2 ln J), μ = ½ Σ_k μ_k α_k.
 
-    *When it breaks*: it needs J > 0. It is stable at every stretch if each μ_k α_k is positive, which is Drucker's
-    condition of each term: fit by `with_shear_moduli`. Two exponents of one sign are nearly the same to data of one
-    kind of test: fit several kinds together. Each particle needs an eigenvalue
-    problem; where the exponents are 2 and −2, `MooneyRivlin` is the same law without.
+    *When it breaks*: it needs J > 0. It is stable at every stretch if each μ_k α_k is positive, Drucker's condition of
+    each term: fit by `with_shear_moduli`. Two exponents of one sign are nearly the same to data of one kind of test:
+    fit several kinds together. A particle takes an eigenvalue problem, which `MooneyRivlin` (2 and −2) spares.
     *Good values*: two or three terms, one exponent 1 to 2, one 4 to 6 for the upturn, one negative near −2 for what
     uniaxial and biaxial tests tell apart; K as for `MooneyRivlin`.
 
@@ -270,15 +269,11 @@ class Ogden(AbstractRubber):
             terms == len(self.exponents) > 0,
             f"Ogden needs a modulus and an exponent for each of its terms, got {terms} and {len(self.exponents)}.",
         )
-        for modulus, exponent in zip(self.moduli, self.exponents, strict=True):
-            require_finite("Ogden's moduli [Pa]", modulus)
-            require_finite("Ogden's exponents", exponent)
-            require_that("Ogden's exponents must not be zero", lambda a: a != 0, exponent)
-        require_that(
-            "Ogden's moduli [Pa] times their exponents must have a positive sum",
-            lambda *a: sum(a[k] * a[k + terms] for k in range(terms)) > 0,
-            *(self.moduli + self.exponents),
-        )
+        require_finite("Ogden's moduli [Pa]", self.moduli)
+        require_finite("Ogden's exponents", self.exponents)
+        require_that("Ogden's exponents must not be zero", lambda a: a != 0, self.exponents)
+        sum_of_moduli = "Ogden's moduli [Pa] times their exponents must have a positive sum"
+        require_that(sum_of_moduli, lambda m, a: (m * a).sum() > 0, self.moduli, self.exponents)
         require_positive("Ogden's bulk_modulus [Pa]", self.bulk_modulus)
 
     @property
@@ -300,10 +295,10 @@ class Ogden(AbstractRubber):
         Args:
             shear_moduli: c_k [Pa], one a term.
         """
-        terms = len(self.exponents)
         require(
-            len(shear_moduli) == terms,
-            f"with_shear_moduli takes one shear modulus for each of its {terms} terms, got {len(shear_moduli)}.",
+            len(shear_moduli) == len(self.exponents),
+            f"with_shear_moduli takes one shear modulus for each of its {len(self.exponents)} terms, got "
+            f"{len(shear_moduli)}.",
         )
         moduli = tuple(2 * c / a for c, a in zip(shear_moduli, self.exponents, strict=True))
         return eqx.tree_at(lambda law: law.moduli, self, moduli)

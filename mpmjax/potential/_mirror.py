@@ -11,6 +11,7 @@ import abc
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -184,15 +185,11 @@ class Mirror(eqx.Module):
 
     def unfold(self, field: NodeVector) -> NodeVector:
         """B v: fill in the mirror images."""
-        for image in self.images:
-            field = image.vector(field)
-        return field
+        return reduce(lambda field, image: image.vector(field), self.images, field)
 
     def fold(self, field: NodeVector) -> NodeVector:
         """Bᵀ f: add to the true nodes what their mirror images received, and leave nothing on the others."""
-        for image in reversed(self.images):
-            field = image.fold(field)
-        return field
+        return reduce(lambda field, image: image.fold(field), reversed(self.images), field)
 
     def unscaled(self, field: NodeVector) -> NodeVector:
         """A velocity of true nodes, as that of which `unfold` makes it by its scaling."""
@@ -222,15 +219,11 @@ class Mirror(eqx.Module):
 
     def unfold_scalar(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
         """B for an even scalar, such as mass."""
-        for image in self.images:
-            field = image.scalar(field)
-        return field
+        return reduce(lambda field, image: image.scalar(field), self.images, field)
 
     def fold_scalar(self, field: Array) -> Array:
         """Bᵀ for an even scalar, shape (n,), or for several in columns, shape (n, c)."""
-        for image in reversed(self.images):
-            field = image.fold_scalar(field)
-        return field
+        return reduce(lambda field, image: image.fold_scalar(field), reversed(self.images), field)
 
     def continued(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
         """A folded even scalar as it is where bodies go on beyond the planes: on a plane twice what is folded there."""

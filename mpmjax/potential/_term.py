@@ -39,10 +39,8 @@ class Displacement:
 class Forces(NamedTuple):
     """Forces on the nodes, f_i + Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b). Those of several terms share one scatter."""
 
-    nodes: NodeVector | None = None
-    """f_i [N], shape (n, d)."""
-    value: Float[Array, "d p"] | None = None
-    """a_p [N], shape (d, p)."""
+    nodes: NodeVector | None = None  # f_i [N], shape (n, d)
+    value: Float[Array, "d p"] | None = None  # a_p [N], shape (d, p)
     slopes: Float[Array, "k k p"] | None = None
     """a_p,b [J], shape (d, d, p), the derivative's direction b first; in bodies of revolution (3, 3, p)."""
 
@@ -85,19 +83,12 @@ class AbstractStiffness(eqx.Module):
         return False
 
     def diagonal(self, stencil: Stencil, size: int) -> Forces:
-        """An approximation of the diagonal of H [N/m], for preconditioners: on nodes, and as factors of w_ip² and
-        g_ip,b². Default: zero.
-
-        Args:
-            stencil: the particles' stencil.
-            size: number of nodes.
-        """
-        del stencil, size
+        """An approximation of the diagonal of H [N/m], for preconditioners: on n = `size` nodes, as factors of w_ip²
+        and of g_ip,b². Default: zero."""
         return Forces()
 
     def damped(self, rate: Scalar) -> "AbstractStiffness":
         """H + r D, with r [1/s] and the D of `AbstractTerm.resistance`. Default: H, for terms without resistance."""
-        del rate
         return self
 
 
@@ -132,22 +123,15 @@ class AbstractTerm(eqx.Module):
     def is_admissible(self, moved: Displacement) -> Bool[Array, ""] | None:
         """Whether the energy is defined at a displacement; None if it always is, which is the default. The line search
         of Newton's method avoids the others."""
-        del moved
         return None
 
     def resistance(self, velocity: Displacement) -> Forces | None:
         """D v, the force that takes a velocity of the nodes, D symmetric and positive semi-definite. Default: None."""
-        del velocity
         return None
 
     def drag(self, size: int) -> tuple[Forces, Float[Array, ""]] | None:
-        """The viscous force at the velocity at the start of the step, for explicit integrators, and the power [W] that
-        it dissipates. Default: None.
-
-        Args:
-            size: number of nodes.
-        """
-        del size
+        """The viscous force on n = `size` nodes at the velocity at the start of the step, for explicit integrators, and
+        the power [W] that it dissipates. Default: None."""
         return None
 
     def stability_rates(
@@ -156,22 +140,19 @@ class AbstractTerm(eqx.Module):
         """z [1/s²] and y [1/s] of each particle, or numbers, that energy and resistance add to the left side of the
         bound Δt² z + Δt y ≤ 4 of `stable_dt`. Default: None, for which `stable_dt` raises.
 
-        A spring k between a particle of mass m, at an arm r from it, and the ground has z = 2 k (1 + A r²)/m, and a
-        dashpot c has y = 4 c (1 + A r²)/m.
+        A spring k to the ground at an arm r of a mass m has z = 2 k (1 + A r²)/m, a dashpot c y = 4 c (1 + A r²)/m.
 
         Args:
             mass: masses of the particles m [kg], shape (p,).
             steepness: A [1/m²] (see `stable_dt`), shape (p,).
         """
-        del mass, steepness
         return None
 
 
 class _JvpStiffness(AbstractStiffness):
     term: AbstractTerm
     at: NodeVector
-    rate: Any = None
-    """r [1/s]; None without resistance."""
+    rate: Any = None  # r [1/s]; None without resistance
 
     def __call__(self, moved: Displacement) -> Forces:
         def force(u: NodeVector) -> NodeVector:
@@ -188,13 +169,10 @@ class _JvpStiffness(AbstractStiffness):
 
 
 class AbstractSpring(AbstractTerm, AbstractStiffness):
-    """Springs ½ Σ_s k_s (e_s + N_s u)² whose elongation is linear in the displacement, N a linear map. Their Hessian
-    Nᵀ k N is the same everywhere."""
+    """Springs ½ Σ_s k_s (e_s + N_s u)² of an elongation linear in the displacement, of constant Hessian Nᵀ k N."""
 
-    stretch: eqx.AbstractVar[Array]
-    """e_s at u = 0 [m]."""
-    stiffness: eqx.AbstractVar[Array]
-    """k_s [N/m], in the same shape."""
+    stretch: eqx.AbstractVar[Array]  # e_s at u = 0 [m]
+    stiffness: eqx.AbstractVar[Array]  # k_s [N/m], in the same shape
 
     @abc.abstractmethod
     def elongation(self, moved: Displacement) -> Array:
@@ -215,7 +193,6 @@ class AbstractSpring(AbstractTerm, AbstractStiffness):
         return self.spread(-self.stiffness * self.stretched(moved), moved.size)
 
     def hessian(self, moved: Displacement) -> "AbstractSpring":
-        del moved
         return self
 
     def __call__(self, moved: Displacement) -> Forces:

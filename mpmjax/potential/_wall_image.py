@@ -18,28 +18,18 @@ class WallImage(eqx.Module):
     columns 1, and so have the masks of rows, which broadcast with them.
     """
 
-    shape: tuple[int, ...] = eqx.field(static=True)
-    """The grid's shape, of each of its layers."""
+    shape: tuple[int, ...] = eqx.field(static=True)  # the grid's shape, of each of its layers
     layers: int = eqx.field(static=True)  # layers of nodes, one a body
     axis: int = eqx.field(static=True)  # the wall's normal
-    start: Int[Array, ""]
-    """The first row's number along the axis."""
-    b: Int[Array, ""]
-    """The number of the row b."""
-    base: Bool[Array, "..."]
-    """The row b."""
-    follows: Bool[Array, "..."]
-    """The rows behind b, which have its normal velocity times B."""
-    share: Float[Array, "..."]
-    """B of b, which is 1, and of the rows behind it; zero at others."""
-    tied: Bool[Array, "..."]
-    """The rows that have the tangential velocity of b."""
-    first: Bool[Array, "..."]
-    """The first row from behind that has a tangential velocity of its own."""
-    held: Bool[Array, "..."] | None = None
-    """The columns where the wall holds; None for all of them."""
-    sticks: bool = eqx.field(static=True, default=False)
-    """Whether the rows behind b have its whole velocity times B."""
+    start: Int[Array, ""]  # the first row's number along the axis
+    b: Int[Array, ""]  # the number of the row b
+    base: Bool[Array, "..."]  # the row b
+    follows: Bool[Array, "..."]  # the rows behind b, which have its normal velocity times B
+    share: Float[Array, "..."]  # B of b, which is 1, and of the rows behind it; zero at others
+    tied: Bool[Array, "..."]  # the rows that have the tangential velocity of b
+    first: Bool[Array, "..."]  # the first row from behind that has a tangential velocity of its own
+    held: Bool[Array, "..."] | None = None  # the columns where the wall holds; None for all of them
+    sticks: bool = eqx.field(static=True, default=False)  # whether the rows behind b have its whole velocity times B
 
     def blocks(self, field: Array) -> Array:
         """A field of shape (n,) or (n, c), or blocks, as blocks."""

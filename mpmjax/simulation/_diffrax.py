@@ -34,8 +34,7 @@ class RolloutState(eqx.Module):
     """Linear and angular impulse on the scene's colliders since the rollout began; None without colliders."""
     boundary_impulse: Impulses | None = None
     """Linear and angular impulse on the scene's boundaries; None unless the scene has `boundary_forces`."""
-    memory: Any = None
-    """The memory of the run's control."""
+    memory: Any = None  # the memory of the run's control
     order: MemoryOrder | None = None
     """The order of the particles in memory; None if it is that in which they were given."""
 
@@ -211,7 +210,6 @@ class StepSolver(diffrax.AbstractSolver):
 
     def order(self, terms: Any) -> int:
         """Order in time; nothing depends on it, since Δt is constant."""
-        del terms
         return 1
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: RolloutState, args: Problem) -> tuple[RunStatistics, Array]:
@@ -272,7 +270,6 @@ class SegmentAdjoint(diffrax.AbstractAdjoint):
     where segments have segments. Steps beyond the last one do nothing."""
 
     def loop(self, *, throw: Any, passed_solver_state: Any, passed_controller_state: Any, **of_diffrax: Any) -> Any:
-        del throw, passed_solver_state, passed_controller_state
         return self._loop(inner_while_loop=None, outer_while_loop=self._nested_loops, **of_diffrax)
 
     def _nested_loops(self, cond_fun: Any, body_fun: Any, state: Any, *, max_steps: int, buffers: Any) -> Any:

@@ -151,8 +151,7 @@ class Forces(NamedTuple):
     """The mean of the times of the steps' forces [s], shape (f − 1,): t_n + θΔt, with θ the method's `force_at`. It is
     half way between frames with θ = ½ (`ImplicitMidpoint`, `TRBDF2`, `SemiImplicit` with β = ½), ½Δt later with θ = 1
     (`BackwardEuler`, `SemiImplicit` with β = 1), and ½Δt earlier with θ = 0 (`Explicit`)."""
-    force: Float[Array, "g k d"]
-    """Friction included [N], shape (f − 1, k, d)."""
+    force: Float[Array, "g k d"]  # friction included [N], shape (f − 1, k, d)
     torque: Float[Array, "g k r"]
     """About the centre of the collider's rotation, or where it has none about its shape's middle, as it moves [N m],
     shape (f − 1, k, r): r = 1 in 2-D, 3 in 3-D, 0 in 1-D. Of a grip about its region's middle, of other boundaries

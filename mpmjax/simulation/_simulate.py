@@ -122,9 +122,8 @@ def simulate(
     first, dt_ = canonical((start, dt), dtype)
     begin = initial_state(Problem(scene, particles, dt_, method, control=control, memory=memory))
     state_bytes = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(begin))
-    traced = is_traced(
-        (begin, scene, particles, dt_, method, observe, control)
-    )  # under jax.jit also if all that was passed is known
+    # under jax.jit also if all that was passed is known
+    traced = is_traced((begin, scene, particles, dt_, method, observe, control))
     if save_every is not None and observe is None:
         frames = count // save_every + 2
         require_memory(
@@ -147,20 +146,9 @@ def simulate(
     problem = Problem(scene, particles, dt_, method, start=first, **held)
     go = partial(integrate, problem, begin, max_steps=count, adjoint=adjoint, progress=progress, watch=not traced)
     end = go(until=np.asarray(np.inf, dtype))
-    values, on_colliders, on_boundaries, memories = end.saved
-    run = run_to(
-        problem,
-        end.state,
-        end.step,
-        end.statistics,
-        steps=end.steps,
-        frames=values if observe is None else None,
-        observed=None if observe is None else values,
-        report=end.report if traced else None,
-        collider_impulse=on_colliders,
-        boundary_impulse=on_boundaries,
-        memory=memories,
-    )
+    names = ("frames" if observe is None else "observed", "collider_impulse", "boundary_impulse", "memory")
+    saved = dict(zip(names, end.saved, strict=True)) | {"steps": end.steps, "report": end.report if traced else None}
+    run = run_to(problem, end.state, end.step, end.statistics, **saved)
     if not throw:
         return run
     if traced:

@@ -2,6 +2,7 @@
 step: how the nodes move them, and how forces on them reach the nodes."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,6 +23,8 @@ Numbers = Float[Array, "s"] | Float[np.ndarray, "s"] | tuple[float | int | Array
 _NARROW = 1.999  # a patch narrower than so many particle spacings is not resolved
 _FAR = 2.0  # how many particle spacings a point may lie off the nearest particle
 _ROUNDED = 1e-4  # how far the sum of shares may be from one, for rounding's sake
+_DEEP = 4  # particles of a column; with two the stress next to a pressed surface is twice as far off
+_BESIDE = 0.3  # share of its length and of its volume by which a cell of a column may differ from the first one
 
 
 class AbstractPlace(eqx.Module):
@@ -41,27 +44,38 @@ class AttachedPoints(AbstractPlace):
     """Points that move with the nearest particle, x_s = x_p + F_p R_s. `Patch` and `PointsAt` make them.
 
     Args:
-        particle: the number of each point's particle, as a float, as all numbers of a scene are, shape (s,).
+        particle: the number of each point's particle, as a float, as all numbers of a scene are, shape (s,); with a
+            column also those of the k − 1 particles below it, shape (k, s).
         offset: R_s = F_p⁻¹ (x_s − x_p) [m], shape (s, d).
         weight: the undeformed area of the surface that each stands for [m^(d−1)], or its share of a whole [-], shape
             (s,).
         place: where they were when they were attached [m], shape (s, d).
         area: outward normal times area of the undeformed surface [m^(d−1)], shape (s, d); None of points.
+        share: of a force on a point, on each particle of its column [-], (k, s), which sum to one; zero on those behind
+            its end. Default: no columns.
+        moment: of a force on a point, its arm about each of these particles times the share, undeformed [m], (k, s, d).
     """
 
-    particle: Float[Array, "s"] | Float[np.ndarray, "s"]
+    particle: Float[Array, "*k s"] | Float[np.ndarray, "*k s"]
     offset: Float[Array, "s d"] | Float[np.ndarray, "s d"]
     weight: Float[Array, "s"] | Float[np.ndarray, "s"]
     place: Float[Array, "s d"] | Float[np.ndarray, "s d"]
     area: Float[Array, "s d"] | Float[np.ndarray, "s d"] | None = None
+    share: Float[Array, "k s"] | Float[np.ndarray, "k s"] | None = None
+    moment: Float[Array, "k s d"] | Float[np.ndarray, "k s d"] | None = None
 
     def __check_init__(self):
         require_fields(self)
-        s = shape_of(self.particle)
+        k, s = shape_of(self.particle), shape_of(self.weight)
         rows = [shape_of(a) for a in (self.offset, self.place, self.area) if a is not None]
+        columns = [None if a is None else shape_of(a)[:2] for a in (self.share, self.moment)]
         require(
-            len(s) == 1 and shape_of(self.weight) == s and all(r[:1] == s for r in rows) and s[0] > 0,
-            f"AttachedPoints need one row a point in each of their arrays, got {s} and {rows}.",
+            len(s) == 1 and all(r[:1] == s for r in rows) and s[0] > 0 and k in (s, (*k[:1], *s)),
+            f"AttachedPoints need one row a point in each of their arrays, got {k}, {s} and {rows}.",
+        )
+        require(
+            columns == [None if k == s else k] * 2,
+            f"AttachedPoints with columns need a share and a moment for each particle {k}, others none, got {columns}.",
         )
 
     @property
@@ -69,14 +83,13 @@ class AttachedPoints(AbstractPlace):
         return shape_of(self.offset)[1]
 
     def attached(self, particles: Particles) -> "AttachedPoints":
-        del particles
         return self
 
     def revolved(self, particles: Particles) -> "AttachedPoints":
         """The points of a surface in a section as rings: with 2πr0 times the area."""
         if self.area is None:
             return self
-        rows, groups = np.asarray(self.particle).astype(int), particles.groups
+        rows, groups = np.atleast_2d(np.asarray(self.particle))[0].astype(int), particles.groups
         hoop = np.concatenate(
             [np.ones(q.rows[1] - q.rows[0]) if q.stored is None else q.stored[:, 2, 2] for q in groups]
         )
@@ -150,7 +163,36 @@ class Patch(AbstractPlace):
         summed = np.zeros((one.shape[1], 1 + 2 * self.dim))
         np.add.at(summed, piece.reshape(-1), np.column_stack([weight, weight[:, None] * middle, area]))
         whole, moment, area = np.split(summed, [1, 1 + self.dim], axis=1)
-        return _attached(particles, one[0], moment / whole, whole[:, 0], area)
+        middle = moment / whole
+        rows, *column = self._columns(particles, one[0], middle, area)
+        return _attached(particles, rows, middle, whole[:, 0], area, *column)
+
+    def _columns(
+        self, particles: Particles, particle: np.ndarray, middle: np.ndarray, area: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Particles, shares and moments [m] of a force on each point, (k, s), (k, s) and (k, s, d).
+
+        A column goes down from a point through cells as high as that of its particle, up to the first that is beside
+        its particle, of another volume or outside the region. Cell j takes the share b_j ∝ j + ½ in its middle y_j, and
+        what is left for those below passes as a stress: m_j = b_j (y_j − x_j) + h (b_j/2 + Σ_k>j b_k) n. So the stress
+        that balances the load is smooth there, which sums over particles need, and Σ_j b_j x_j + m_j is the point.
+        """
+        x, volume = np.asarray(particles.x, float), np.asarray(particles.volume, float)
+        normal = area / np.sqrt((area**2).sum(axis=1))[:, None]
+        height = 2 * ((middle - x[particle]) * normal).sum(axis=1)
+        along = np.arange(_DEEP)[:, None] + 0.5
+        y = middle - (along * height)[:, :, None] * normal
+        far, rows = _tree(x).query(y)
+        inside = np.asarray(self.region.contains(jnp.asarray(y.reshape(-1, self.dim)))).reshape(far.shape)
+        alike = (far < _BESIDE * height) & (abs(volume[rows] / volume[particle] - 1) < _BESIDE) & inside
+        rows[0], alike[0] = particle, True
+        alike = np.logical_and.accumulate(alike)
+        share = along * alike
+        share /= share.sum(axis=0)
+        through = (share[::-1].cumsum(axis=0)[::-1] - share / 2) * height * alike
+        k = alike.any(axis=1).sum()
+        moment = share[:, :, None] * (y - x[rows]) + through[:, :, None] * normal
+        return np.where(alike, rows, particle)[:k], share[:k], moment[:k]
 
 
 class PointsAt(AbstractPlace):
@@ -168,11 +210,8 @@ class PointsAt(AbstractPlace):
         require_fields(self)
         shape = shape_of(self.positions)
         require(len(shape) == 2 and shape[0] > 0, f"PointsAt need positions of shape (s, d), got {shape}.")
-        require(
-            self.weights is None or shape_of(self.weights) == shape[:1],
-            f"PointsAt need one weight a position, got {self.weights}.",
-        )
         if self.weights is not None:
+            require(shape_of(self.weights) == shape[:1], f"PointsAt need one weight a position, got {self.weights}.")
             require_that(
                 "PointsAt's weights are shares of the load and must sum to one (divide them by their sum)",
                 lambda w: abs(w.sum() - 1) < _ROUNDED,
@@ -187,7 +226,7 @@ class PointsAt(AbstractPlace):
         x, apart = _positions(particles, self)
         at = np.asarray(self.positions, float)
         weight = np.full(len(at), 1 / len(at)) if self.weights is None else np.asarray(self.weights, float)
-        return _attached(particles, _nearest(x, at, apart, self), at, weight, None)
+        return _attached(particles, _nearest(x, at, apart, self)[None], at, weight)
 
 
 def _positions(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, float]:
@@ -204,11 +243,16 @@ def _positions(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, 
     return np.asarray(particles.x, float), float(np.median(volume[volume > 0]) ** (1 / particles.dim))
 
 
-def _nearest(x: np.ndarray, positions: np.ndarray, apart: float, place: AbstractPlace) -> np.ndarray:
-    """The number of the particle nearest to each position."""
+def _tree(x: np.ndarray) -> Any:
+    """The search tree for the nearest of positions."""
     from scipy.spatial import KDTree  # here, since it takes long to import
 
-    far, particle = KDTree(x).query(positions)
+    return KDTree(x)
+
+
+def _nearest(x: np.ndarray, positions: np.ndarray, apart: float, place: AbstractPlace) -> np.ndarray:
+    """The number of the particle nearest to each position."""
+    far, particle = _tree(x).query(positions)
     require(
         far <= _FAR * apart,
         f"The {type(place).__name__} has a point at {positions[far.argmax()]} m, {far.max():.3g} m off the nearest "
@@ -218,30 +262,43 @@ def _nearest(x: np.ndarray, positions: np.ndarray, apart: float, place: Abstract
 
 
 def _attached(
-    particles: Particles, particle: np.ndarray, positions: np.ndarray, weight: np.ndarray, area: np.ndarray | None
+    particles: Particles,
+    rows: np.ndarray,
+    positions: np.ndarray,
+    weight: np.ndarray,
+    area: np.ndarray | None = None,
+    share: np.ndarray | None = None,
+    moment: np.ndarray | None = None,
 ) -> AttachedPoints:
-    """Points at positions [m], with their undeformed offsets and areas (Nanson's formula): A = Fᵀ a / det F."""
+    """Points at positions [m] on particles, (k, s), with undeformed offsets, moments and areas (Nanson's formula):
+    A = Fᵀ a / det F."""
     dtype = particles.x.dtype
     require(
         particles.count < 2 ** (jnp.finfo(dtype).nmant + 1),
         f"{dtype} counts particles exactly only below {2 ** (jnp.finfo(dtype).nmant + 1)}: use float64.",
     )
-    offset = positions - np.asarray(particles.x, float)[particle]
+    if len(rows) == 1:
+        share = moment = None
+    offset = positions - np.asarray(particles.x, float)[rows[0]]
     kept = [np.asarray(F, float) for F in particles.deformations if F is not None and F.ndim == 3]
     if len(kept) == len(particles.deformations):
         d = particles.dim
-        F = np.concatenate(kept)[particle, :d, :d]
+        every = np.concatenate(kept)[rows, :d, :d]
+        F = every[0]
         offset = np.linalg.solve(F, offset[:, :, None])[:, :, 0]
+        if moment is not None:
+            moment = np.asarray(np.linalg.solve(every, moment[..., None]))[..., 0]
         if area is not None:
             turned: np.ndarray = (np.swapaxes(F, 1, 2) @ area[:, :, None])[:, :, 0] / np.linalg.det(F)[:, None]
             area, weight = turned, np.sqrt((turned**2).sum(axis=1))
-    arrays = (particle, offset, weight, positions, area)
+    arrays = (rows[0] if moment is None else rows, offset, weight, positions, area, share, moment)
     return AttachedPoints(*jax.device_put([a if a is None else np.asarray(a, dtype) for a in arrays]))
 
 
 class LoadedPoints(eqx.Module):
     """s points that move with particles: u_s = Σ_i N_is u_i with N_is = w_ip + g_ip·r_s, the particle's own motion at
-    the arm r_s. So a force reaches no node that its particle does not reach, its sum is right and so is its moment."""
+    the arm r_s. So a force reaches no node that its particle does not reach, its sum is right and so is its moment.
+    Forces that are given act by their columns where there are any, Σ_j b_j w_ij + m_j·g_ij, with the same two."""
 
     x: Float[Array, "d s"]  # where they are [m]
     v: Float[Array, "d s"]  # their velocity, v_p + C_p r_s, without a C v_p [m/s]
@@ -254,6 +311,9 @@ class LoadedPoints(eqx.Module):
     arm: Float[Array, "d s"]  # r_s [m]: F_p R_s, in the total description R_s
     stencil: Stencil  # nodes, weights and derivatives of the particle that each point is attached to
     particle: Int[Array, "s"]  # the number of that particle, shape (s,)
+    column: Stencil | None = None  # of the k particles of each column, one after the other; None without columns
+    share: Float[Array, "m s"] | None = None  # b [-]
+    moment: Float[Array, "d m s"] | None = None  # m [m]: F_p m, in the total description m
 
     def after(self, time: Scalar) -> "LoadedPoints":
         """The points moved on by a time [s] with their velocity, and turned with its gradient."""
@@ -274,6 +334,14 @@ class LoadedPoints(eqx.Module):
     def nodal(self, force: Float[Array, "d s"], size: int) -> NodeVector:
         """Σ_s N_is f_s, the transpose of `displacement`, shape (n, d)."""
         return scatter(self.stencil, force, self.arm[:, None] * force, size)
+
+    def loaded(self, force: Float[Array, "d s"], size: int) -> NodeVector:
+        """The forces on nodes by given forces on the points, through their columns, shape (n, d)."""
+        if self.column is None or self.share is None or self.moment is None:
+            return self.nodal(force, size)
+        d, each = len(force), force[:, None]
+        slopes = (self.moment[:, None] * each).reshape(d, d, -1)
+        return scatter(self.column, (self.share * each).reshape(d, -1), slopes, size)
 
     def diagonal(self, coefficient: Float[Array, "d s"], size: int) -> NodeVector:
         """Σ_s (w_ip² + Σ_b g_ip,b² r_sb²) k_s [N/m], shape (n, d): a non-negative approximation of the diagonal of

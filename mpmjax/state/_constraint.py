@@ -16,10 +16,8 @@ class AbstractLayerImage(AbstractImage):
     """The map B of a constrained body, whose layer of nodes moves by fewer numbers q than it has: u = B q. They stand
     at the layer's first nodes, to which Bᵀ brings masses, momenta and forces."""
 
-    layer: eqx.AbstractVar[int]
-    """The number of the body's layer of m nodes."""
-    layers: eqx.AbstractVar[int]
-    """How many layers the grid has."""
+    layer: eqx.AbstractVar[int]  # the number of the body's layer of m nodes
+    layers: eqx.AbstractVar[int]  # how many layers the grid has
 
     def own(self, field: Array) -> Array:
         """The part of a field of all nodes that is of its layer, shape (m, ...)."""
@@ -39,8 +37,7 @@ class AbstractConstraint(eqx.Module):
     """A constraint on how one body moves, a part of every step, solve and derivative: a linear map of the body's nodes,
     as a mirror is (see `Rigid`). The law brings it, by its method `constraint`."""
 
-    number: eqx.AbstractVar[int]
-    """Index of the body's material in the scene."""
+    number: eqx.AbstractVar[int]  # index of the body's material in the scene
 
     @property
     @abc.abstractmethod

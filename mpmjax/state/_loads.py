@@ -49,7 +49,6 @@ class AbstractLoad(eqx.Module):
     def term(self, points: LoadedPoints, t: Scalar) -> AbstractTerm | None:
         """The term of the potential that it adds in a step, with the ground as at time t: part of implicit solves,
         `stable_dt` and budgets. Default: None."""
-        del points, t
         return None
 
     def check(self, dim: int) -> None:
@@ -92,7 +91,6 @@ class Traction(AbstractLoad):
         _check_dead_load("Traction's traction", self, self.traction, dim)
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
-        del dt
         return points.weight * value_at(self.traction, t)[:, None]
 
 
@@ -119,7 +117,6 @@ class PointLoad(AbstractLoad):
         _check_dead_load("PointLoad's total", self, self.total, dim)
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
-        del dt
         return points.weight * value_at(self.total, t)[:, None]
 
 
@@ -179,7 +176,6 @@ class Support(AbstractSpring):
         return Forces(nodes=self.points.nodal(amount, size))
 
     def diagonal(self, stencil: Stencil, size: int) -> Forces:
-        del stencil
         return Forces(nodes=self.points.diagonal(self.stiffness, size))
 
     @property
@@ -282,8 +278,8 @@ def points_of(
         F = jnp.concatenate(parts)
 
     def at(on: AttachedPoints) -> LoadedPoints:
-        rows = jnp.asarray(on.particle, dtype).astype(jnp.int32)
-        offset = jnp.asarray(on.offset, dtype).T
+        column, below = jnp.asarray(on.particle, dtype).astype(jnp.int32), {}
+        rows, offset = jnp.atleast_2d(column)[0], jnp.asarray(on.offset, dtype).T
         deformation = None if F is None else components(F[rows])
         arm = offset if deformation is None else la.matmul(deformation[:d, :d], offset[:, None])[:, 0]
         r = offset if total else arm
@@ -293,6 +289,12 @@ def points_of(
             v = v + la.matmul(C, r[:, None])[:, 0]
             L = C if stencil.radius is None else in_space(stencil.radius[rows], components(particles.v[rows]), C)
             rate = None if deformation is None else L if total else la.matmul(L, deformation)
+        if on.moment is not None:
+            moment = jnp.moveaxis(jnp.asarray(on.moment, dtype), -1, 0)
+            if F is not None and not total:
+                whole = jnp.moveaxis(F[column], (-2, -1), (0, 1))
+                moment = la.matmul(whole[:d, :d], moment[:, None])[:, 0]
+            below = {"column": stencil.of(column.reshape(-1)), "share": jnp.asarray(on.share, dtype), "moment": moment}
         return LoadedPoints(
             x=components(particles.x[rows]) + arm,
             v=v,
@@ -304,6 +306,7 @@ def points_of(
             arm=r,
             stencil=stencil.of(rows),
             particle=rows,
+            **below,
         )
 
     return tuple(at(load.on) for load in loads if isinstance(load.on, AttachedPoints))  # `prepare` refuses others
@@ -319,7 +322,7 @@ def load_force(
         later = at.after(part * dt) if part > 0 and load.moves_points_on else at
         force = load.force(later, t + part * dt if part > 0 else t, dt)
         if force is not None:
-            nodal = at.nodal(force, size)
+            nodal = at.loaded(force, size)
             total = nodal if total is None else total + nodal
     return total
 

@@ -97,13 +97,9 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     C = particles.C
     if scene.keeps_gradient and C is None:
         C = jax.device_put(xp.zeros((p, d, d), particles.x.dtype))
-    prepared = replace(
-        particles,
-        deformations=tuple(deformation for deformation, _ in materials),
-        histories=tuple(history for _, history in materials),
-        C=C if scene.keeps_gradient else None,
-        X=(particles.x if particles.X is None else particles.X) if scene.total else None,
-    )
+    deformations, histories = zip(*materials, strict=True)
+    C, X = C if scene.keeps_gradient else None, scene.anchor(particles) if scene.total else None
+    prepared = replace(particles, deformations=deformations, histories=histories, C=C, X=X)
     # the arrays of a step: mass, momentum, velocity and force of the nodes; the state before and after it; the stencil
     n, state = scene.grid.size, sum(leaf.size for leaf in jax.tree.leaves(prepared))
     numbers = n * (1 + 3 * d) + 2 * state + p * 3 * d * (scene.kernel.order + 1)

@@ -127,9 +127,8 @@ class Scene(eqx.Module):
         gravity: body acceleration [m/s²], (d,). Default: none.
         boundary: one boundary condition or several; where two prescribe the same component, the earlier holds.
         kernel: B-spline. Default: quadratic.
-        gradient: gradient operator of force and deformation. Default: the spline's in the total description with the
-            quadratic kernel, where stresses are of second order with it and of first with the other; else moving least
-            squares.
+        gradient: gradient operator of force and deformation. Default: the spline's in the total description, where
+            stresses have a higher order with it, else moving least squares.
         transfer: PIC, FLIP or APIC. Default: APIC.
         description: updated (default) or total Lagrangian.
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
@@ -189,8 +188,7 @@ class Scene(eqx.Module):
         if grid.axisymmetric:
             self.boundary = with_axis(self.boundary, grid)
         self.kernel = kernel
-        rough = description.total and kernel == BSpline(2)  # where moving least squares is
-        self.gradient = gradient or (SplineGradient() if rough else MLSGradient())
+        self.gradient = gradient or (SplineGradient() if description.total else MLSGradient())
         self.transfer, self.description = transfer, description
         self.body_force, self.boundary_forces = body_force, boundary_forces
         self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
@@ -283,17 +281,10 @@ class Scene(eqx.Module):
 
     def material_points(self, particles: Particles, t: Scalar = 0.0) -> tuple[MaterialPoints, ...]:
         """The materials of prepared particles at time t [s], with the elastic laws in force."""
-        materials = tuple(
-            MaterialPoints(
-                law=law.elastic(group.history),
-                volume=particles.volume[slice(*group.rows)],
-                deformation=group.deformation(),
-                total=self.total,
-                rows=group.rows,
-                viscosity=law.viscosity,
-            )
-            for law, group in zip(self.laws, particles.groups, strict=True)
-        )
+        materials = ()
+        for law, q in zip(self.laws, particles.groups, strict=True):
+            volume, elastic = particles.volume[slice(*q.rows)], law.elastic(q.history)
+            materials += (MaterialPoints(elastic, volume, q.deformation(), self.total, q.rows, law.viscosity),)
         if (averaged := self.volume) is None:
             return materials
         grid, window, positions = self.grid.with_layers(1), self.window(particles), self.on_grid(particles, t)
@@ -309,9 +300,9 @@ class Scene(eqx.Module):
         admits after a step dt [s]."""
         groups = zip(self.laws, particles.groups, strict=True)
         mapped = [law.return_map(group.deformation(), group.history, dt) for law, group in groups]
-        deformations = tuple(particle_first(deformation) for deformation, _ in mapped)
-        histories = tuple(history for _, history in mapped)
-        return with_state(particles, State(particles.x, particles.v, particles.C, deformations, histories))
+        deformations, histories = zip(*mapped, strict=True)
+        after = State(particles.x, particles.v, particles.C, tuple(map(particle_first, deformations)), histories)
+        return with_state(particles, after)
 
     @property
     def collider_count(self) -> int:

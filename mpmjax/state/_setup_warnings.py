@@ -53,17 +53,12 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
             nearest = _nearest(condition, grid, volume)
             beyond = [wall.inward * (x[:, wall.axis] - np.asarray(wall.position)) < nearest for wall in walls]
             inside = np.any(beyond, axis=0).sum()
-        if inside and condition.pushes:
-            warn(
-                f"{inside} of {len(x)} particles lie in or beyond the {name} at the start, or nearer to it "
-                "than a quarter of their width: it pushes their faces away, half a width before their centres. Move "
-                "one of them."
-            )
-        elif inside:
-            warn(
-                f"{inside} of {len(x)} particles lie in or beyond the {name} at the start: nodes there do "
-                "not move freely. Move one of them; to hold a body on purpose take a Grip."
-            )
+        if inside:
+            why = ": nodes there do not move freely. Move one of them; to hold a body on purpose take a Grip."
+            if condition.pushes:
+                why = ", or nearer to it than a quarter of their width: it pushes their faces away, half a width"
+                why += " before their centres. Move one of them."
+            warn(f"{inside} of {len(x)} particles lie in or beyond the {name} at the start{why}")
         if any(law.flows for law in scene.laws) and (told := _unfit_for_fluids(condition, dx)):
             warn(f"The {name} {told}")
         if mask is not None:

@@ -96,13 +96,8 @@ def find_active_set(
         pulls, enters = held.violations(new.motion.velocity, holding)
         # all places are exchanged at once (a primal-dual active set), so that the sweeps do not grow with their number
         active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
-        return (
-            active,
-            new.motion.carrier,
-            cost.followed_by(new.solve),
-            count_places(nodes, pulls, enters) > 0,
-            count + 1,
-        )
+        changes = count_places(nodes, pulls, enters) > 0
+        return active, new.motion.carrier, cost.followed_by(new.solve), changes, count + 1
 
     guess, zero, none = method.initial_guess(nodes), jnp.zeros((), nodes.mass.dtype), jnp.asarray(0, jnp.int32)
     start = method.mean_displacement(nodes, NodeMotion(guess))

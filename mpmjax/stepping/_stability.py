@@ -43,26 +43,20 @@ def stable_dt(
     """The longest step Δt [s] for which motion about the present state of the particles does not grow.
 
     The limit of a particle alone on the grid is known exactly, and a set of particles has no lower limit than the
-    lowest of its members (B. M. Irons, G. Treharne, Proc. 3rd Conf. on Matrix Methods in Structural Mechanics, 1971,
-    for frequencies; for APIC and PIC the same argument holds with the velocity that the transfer keeps: derivation,
-    section 12). So Δt is the least over particles of Δt² = 4 ρ0 / (Λ (2Ξ − κa)) (eq. 32), where
+    lowest of its members (B. M. Irons, G. Treharne, Proc. 3rd Conf. on Matrix Methods in Structural Mechanics, 1971;
+    derivation, section 12). So Δt is the least over particles of Δt² = 4 ρ0/(Λ (2Ξ − κa)) (eq. 32; at F = I
+    4ρ0/((2μ + dλ)(2Ξ − κa))), with viscosity of Δt² Λ (2Ξ − κa)/ρ0 + Δt Λ_v B/ρ0 = 4 (eq. 34):
 
     - Λ is the largest eigenvalue of the symmetric part of the present tangent L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ with
       L = ∇v and τ = P Fᵀ, by `principal_differential`; in the total description, that of ∂²Ψ/∂F∂F. Stretching and
       compression raise it. With averaged volumes it is that at F̄, or its average where that is larger.
-    - Ξ bounds Σ_i g_ip g_ipᵀ/w_ip. It is a for the moving-least-squares gradient. For the spline's gradient it is the
-      value at the particle in the total description, and in the updated one, where particles move, the largest value
-      in a cell: 6/dx² (quadratic) or 3.137/dx² (cubic).
+    - Ξ is a for the moving-least-squares gradient. For the spline's it is the value at the particle in the total
+      description, and in the updated one the largest in a cell: 6/dx² (quadratic) or 3.137/dx² (cubic).
     - a = 4/dx² (quadratic) or 3/dx² (cubic).
-    - κ is 1 for APIC, and 0 for PIC and FLIP, which forget the affine velocity.
+    - κ = 1 and B = 2a for APIC; κ = 0 and B = 4Ξ for PIC and FLIP, which forget the affine velocity.
 
-    At F = I this is √(4ρ0/((2μ + dλ)(2Ξ − κa))). The limit of the semi-implicit step is 1/√(1 − 2β) times that for
-    β < ½. For the other implicit methods there is no limit: the result is infinite, and says nothing of accuracy.
-
-    With viscosity Δt solves Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 = 4 (derivation, eq. 34) with A = 2Ξ − κa, and B = 2a for APIC,
-    whose stored gradient is multiplied by 1 − Δt a Λ_v/ρ0 in a step, or 4Ξ for PIC and FLIP, whose stored gradient is
-    that of a step ago. Λ_v = |J| max(2η, 2η (1 − d/3) + dζ) is the largest eigenvalue of L ↦ |J| σ_v. The semi-implicit
-    step multiplies both terms by 1 − 2β. The left side has further terms:
+    The limit of the semi-implicit step is 1/√(1 − 2β) times that for β < ½. For the other implicit methods there is no
+    limit: the result is infinite, and says nothing of accuracy. The left side has further terms (notes/stable_step.md):
 
     - of loads what each states (`AbstractTerm.stability_rates`), of springs and dashpots to the ground twice what a
       particle by itself feels;

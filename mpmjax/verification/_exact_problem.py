@@ -76,7 +76,6 @@ class AbstractProblem(eqx.Module):
 
     def body(self, cells: int) -> AbstractRegion:
         """The region of the body at rest, on this grid. Default: the box."""
-        del cells
         return Box(*self.box()[:2])
 
     def rest(self, cells: int, per_side: int, *, fitted: bool = False) -> Particles:
@@ -124,7 +123,6 @@ class Manufactured(AbstractBodyForce):
     X: ParticleVector  # reference positions [m], shape (p, d)
 
     def acceleration(self, x: ParticleVector, t: Scalar) -> ParticleVector:
-        del x
         return jax.vmap(lambda X: self.problem.body_force(X, t))(self.X)
 
 
@@ -173,48 +171,41 @@ def discretise(
     )(X)
     total = choices.get("description", UpdatedLagrangian()).total
     C = rate if total else rate @ jnp.linalg.inv(F)
-    scene = Scene(
-        grid,
-        problem.material,
-        boundary=problem.boundary(),
-        body_force=Manufactured(problem, X) if problem.forced else None,
-        **choices,
-    )
+    force = Manufactured(problem, X) if problem.forced else None
+    scene = Scene(grid, problem.material, boundary=problem.boundary(), body_force=force, **choices)
     return scene, Particles(x, v, rest.mass, rest.volume, deformations=(F,), C=C, X=X)
 
 
-def _frames_and_shares(particles: Particles, run: Run) -> tuple[State, Array, Array]:
-    """The frames of a run, X [m] of its particles, and the share of each in the volume, shape (p,)."""
+def _at_frames(error: Callable[..., Array], particles: Particles, run: Run) -> Array:
+    """The error at each frame, shape (f,), by its state and time, X [m] and the share of each particle in the volume,
+    shape (p,)."""
     if run.frames is None or particles.X is None:
         raise ValueError("The error needs a run with frames (pass save_every to simulate) and particles with X.")
-    return run.frames, particles.X, particles.volume / particles.volume.sum()
+    X, share = particles.X, particles.volume / particles.volume.sum()
+    return jax.lax.map(lambda frame: error(*frame, X, share), (run.frames, run.times))
 
 
 def displacement_error(problem: AbstractProblem, particles: Particles, run: Run) -> Float[Array, "f"]:
     """√(Σ V0 ‖x − x(X, t)‖² / Σ V0) [m] at each saved frame, shape (f,), by the particles from `discretise`, with X,
     and a run with frames."""
-    frames, X, share = _frames_and_shares(particles, run)
 
-    def at(frame: tuple[Array, Array]) -> Array:
-        x, t = frame
+    def error(state: State, t: Array, X: Array, share: Array) -> Array:
         exact = jax.vmap(lambda Y: problem.position(Y, t))(X)
-        return jnp.sqrt((share * ((x - exact) ** 2).sum(axis=1)).sum())
+        return jnp.sqrt((share * ((state.x - exact) ** 2).sum(axis=1)).sum())
 
-    return jax.lax.map(at, (frames.x, run.times))
+    return _at_frames(error, particles, run)
 
 
 def stress_error(problem: AbstractProblem, particles: Particles, run: Run) -> Float[Array, "f"]:
     """Σ V0 ‖P − P(X, t)‖ / Σ V0 [Pa] at each saved frame, shape (f,), with P the first Piola-Kirchhoff stress,
     by the particles from `discretise`, with X, and a run with frames."""
-    frames, X, share = _frames_and_shares(particles, run)
 
-    def at(frame: tuple[Array, Array]) -> Array:
-        F, t = frame
+    def error(state: State, t: Array, X: Array, share: Array) -> Array:
         exact = jax.vmap(lambda Y: problem.deformation(Y, t))(X)
-        miss = jax.vmap(problem.material.stress)(F) - jax.vmap(problem.material.stress)(exact)
+        miss = jax.vmap(problem.material.stress)(state.F) - jax.vmap(problem.material.stress)(exact)
         return (share * jnp.sqrt((miss**2).sum(axis=(1, 2)))).sum()
 
-    return jax.lax.map(at, (frames.F, run.times))
+    return _at_frames(error, particles, run)
 
 
 Measure = Callable[[AbstractProblem, Particles, Run], Float[Array, "f"]]
@@ -275,13 +266,14 @@ class AbstractColumn(AbstractProblem):
     """A column 0 ≤ X ≤ 1 m of ν = 0 on a symmetry plane, under its weight, which is applied slowly. Particles fill it
     exactly; the free end needs no condition."""
 
-    load: eqx.AbstractVar[float]
-    """a, weight over stiffness."""
-    shift: eqx.AbstractVar[float]
+    load: float = 0.04  # a, weight over stiffness
+    shift: float = 0.0
     """Distance of the free end beyond a node, as a fraction of a cell: with it the particles' place in the cell differs
     from cell to cell."""
-    method: ClassVar[AbstractIntegrator]
-    """The integrator that finds the equilibrium."""
+    material: AbstractMaterial = FixedCorotated(1.0, 0.0)  # the law, with ν = 0
+    density: float = 1.0  # ρ0 [kg/m^d]
+    dim: int = eqx.field(static=True, default=1)  # space dimension
+    method: ClassVar[AbstractIntegrator]  # the integrator that finds the equilibrium
 
     @property
     def duration(self) -> float:
@@ -321,19 +313,9 @@ class AbstractColumn(AbstractProblem):
 
 
 class Column(AbstractColumn):
-    """A column of P = E (F − 1), exact at any load below E. At full load P = −a E (1 − X) and x = X − a (X − X²/2).
-
-    Args:
-        load: a, weight over stiffness.
-        shift: distance of the free end beyond a node, as a fraction of a cell.
-    """
+    """A column of P = E (F − 1), exact at any load below E. At full load P = −a E (1 − X) and x = X − a (X − X²/2)."""
 
     method: ClassVar[AbstractIntegrator] = SemiImplicit()
-    load: float = 0.04
-    shift: float = 0.0
-    material: AbstractMaterial = FixedCorotated(1.0, 0.0)  # the law, with ν = 0
-    density: float = 1.0  # ρ0 [kg/m^d]
-    dim: int = eqx.field(static=True, default=1)  # space dimension
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         return X - self.acting(t) * (X - X**2 / 2)
@@ -346,18 +328,11 @@ class HenckyColumn(AbstractColumn):
     with Lambert's W and s = a (1 − X), F = W(s)/s and x = (Φ(a) − Φ(s))/a, Φ = W + W²/2. A load of 0.04 is that of a
     column of 50 m, 80 kg/m³, 1 MPa and g = 10 m/s², the convergence test of AMPLE (W. M. Coombs, C. E. Augarde,
     https://wmcoombs.github.io/tests); a load of 4 that of one of 10 kPa, which is pressed to 0.30 at the bottom.
-
-    Args:
-        load: a, weight over stiffness.
-        shift: distance of the free end beyond a node, as a fraction of a cell.
     """
 
     method: ClassVar[AbstractIntegrator] = BackwardEuler()
     load: float = 4.0
-    shift: float = 0.0
-    material: AbstractMaterial = Hencky(1.0, 0.0)  # the law, with ν = 0
-    density: float = 1.0  # ρ0 [kg/m^d]
-    dim: int = eqx.field(static=True, default=1)  # space dimension
+    material: AbstractMaterial = Hencky(1.0, 0.0)
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         a = self.acting(t)

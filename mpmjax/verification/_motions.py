@@ -142,7 +142,6 @@ class ExpandingRing(AbstractProblem):
         return (-1.0,) * 2, (1.0,) * 2, Ends.PLAIN
 
     def body(self, cells: int) -> Annulus:
-        del cells
         return Annulus((0.0, 0.0), self.inner, self.outer)
 
 
@@ -194,7 +193,6 @@ class Vortex(AbstractProblem):
         return (-1.5,) * 2, (1.5,) * 2, Ends.PLAIN
 
     def body(self, cells: int) -> Annulus:
-        del cells
         return _VORTEX_RING
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
@@ -243,12 +241,8 @@ class StandingWave(AbstractProblem):
 
     def grid(self, cells: int) -> Grid:
         along, across = super().grid(cells), self.dim - 1
-        return Grid(
-            (*along.shape, *(_ACROSS,) * across),
-            along.spacing,
-            origin=(*along.origin, *(0,) * across),
-            periodic=(*along.periodic, *(True,) * across),
-        )
+        shape, origin = (*along.shape, *(_ACROSS,) * across), (*along.origin, *(0,) * across)
+        return Grid(shape, along.spacing, origin=origin, periodic=(*along.periodic, *(True,) * across))
 
     def body(self, cells: int) -> Box:
         (low, high, _), across = self.box(), self.dim - 1
@@ -329,10 +323,7 @@ class TwoDisks(eqx.Module):
         `fitted` to the circles or not (see `fill`), and choices of kernel, gradient and transfer."""
         half = round(0.75 * cells)
         grid = Grid((2 * half + 1,) * 2, 1 / cells, origin=(-half,) * 2)
-        disks = [
-            fill(ball, grid, particles_per_cell=per_side**2, density=self.density, velocity=velocity, fitted=fitted)
-            for ball, velocity in (
-                (Ball((side * self.centre,) * 2, self.radius), (-side * self.speed,) * 2) for side in (-1, 1)
-            )
-        ]
+        alike: Any = {"particles_per_cell": per_side**2, "density": self.density, "fitted": fitted}
+        balls = [(Ball((side * self.centre,) * 2, self.radius), (-side * self.speed,) * 2) for side in (-1, 1)]
+        disks = [fill(ball, grid, velocity=velocity, **alike) for ball, velocity in balls]
         return Scene(grid, self.material, **choices), jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *disks)

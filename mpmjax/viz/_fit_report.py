@@ -40,11 +40,8 @@ def draw_fit(
     heights = [3.0] * len(observations) + [2.6] * (rows - len(observations))
     figure = plt.figure(figsize=(9.6, sum(heights)), layout="constrained")
     grid = figure.add_gridspec(rows, 6, height_ratios=heights)
-    result.plot(
-        [figure.add_subplot(grid[row, :4]) for row in range(len(observations))],
-        measured=shown,
-        predictions=predictions,
-    )
+    panels = [figure.add_subplot(grid[row, :4]) for row in range(len(observations))]
+    result.plot(panels, measured=shown, predictions=predictions)
     for row, (observation, predicted, used) in enumerate(zip(observations, predictions, fitted, strict=True)):
         _draw_residuals(figure.add_subplot(grid[row, 4:]), observation, predicted, float(used.against[1].max()))
     row = len(observations)

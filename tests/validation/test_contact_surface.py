@@ -1,4 +1,5 @@
-"""Where contact is felt: the bounce of a bar and of a block against contact at nodes, the exact one and a finer one."""
+"""Where contact is felt: the bounce of a bar and of a block against contact at nodes, the exact one and a finer one,
+and of a ball against a finer one and Hertz's."""
 
 import sys
 from pathlib import Path
@@ -47,3 +48,17 @@ def test_a_block_bounces_five_times_nearer_to_one_of_four_times_the_resolution()
     assert (now[:, 0] < before[:, 0] / 5).all()
     over_sizes = np.sqrt((before**2).mean(axis=0) / (now**2).mean(axis=0))
     assert (over_sizes > 5).all(), over_sizes
+
+
+@pytest.mark.slow
+def test_a_ball_of_eight_cells_a_radius_bounces_as_one_of_thirty_two():
+    """Peak force and time of contact within 5 % of the finer ball's, and the same wherever the plane lies between
+    nodes. The finer ones agree by both contacts, and by the size of the strain are within a tenth of Hertz's."""
+    fine = contact.ball(32, BOX)
+    assert abs(fine["force"] - 1) < 0.1
+    assert abs(fine["time"] - 1) < 0.1
+    for wall, places in ((BOX, (0.0, 0.25)), ("ContactPlane", (0.0, 0.5))):
+        coarse = [contact.ball(8, wall, at=at) for at in places]
+        for name, exact in fine.items():
+            assert max(abs(found[name] / exact - 1) for found in coarse) < 0.05, (wall, name)
+            assert abs(coarse[0][name] - coarse[1][name]) < 0.02, (wall, name)
