@@ -114,7 +114,10 @@ def test_the_force_of_a_coupling_is_that_of_its_energy(shape, periodic):
     """f = −∂E/∂u, with its Hessian and diagonal; the two bodies' forces are opposite at each node."""
     rng, d, m = np.random.default_rng(0), len(shape), int(np.prod(shape))
     patch = a_patch(mpm.Grid(shape, 0.1, periodic=periodic), rng)
-    parts = rng.normal(size=m), rng.uniform(1, 2, m), rng.normal(size=(m, d))
+    across, normal = np.zeros((d, m)), rng.normal(size=(m, d))
+    stretch = np.concatenate([rng.normal(size=(1, m)), across])
+    stiffness = np.concatenate([rng.uniform(1, 2, (1, m)), across + rng.uniform(1, 2, m)])
+    parts = stretch, stiffness, normal / np.linalg.norm(normal, axis=1, keepdims=True)
     own = Coupling(*(jnp.asarray(part) for part in parts), patch, (0, 2))
     u, du = (jnp.asarray(rng.normal(size=(3 * m, d))) for _ in range(2))
 
@@ -262,10 +265,11 @@ def test_a_block_slides_down_a_slope_as_the_closed_form_says(name):
 
 @pytest.mark.thorough
 def test_a_block_rests_on_a_rough_slope():
-    """tan 30° = 0.577 < 0.8: it does not slide, but for what the slab gives and the lag of friction."""
+    """tan 30° = 0.577 < 0.8: it does not slide, but for what the slab gives and while it bounces. With friction after
+    the solve alone it moves by 44 mm."""
     moved, v = slid("semi_implicit", 0.8, steps=60, dt=0.5 / 60)
-    assert abs(moved[0]) < 0.05 * 1.25  # of what it falls without friction
-    assert abs(v[-1][0]) < 0.1 * 2.5
+    assert abs(moved[0]) < 0.01 * 1.25  # of what it falls without friction
+    assert abs(v[-1][0]) < 0.01 * 2.5
 
 
 @pytest.mark.parametrize("d", [2, *thorough(3)])

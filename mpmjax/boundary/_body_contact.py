@@ -24,6 +24,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractSpringContact, ConstrainedNodes, friction_share
 from mpmjax.discretisation import Grid, Stencil
+from mpmjax.geometry import length
 from mpmjax.potential import AbstractSpring, Displacement, Forces, Mirror
 
 _SAMPLES = 256
@@ -121,26 +122,31 @@ def moment(blocks: Array, axis: int, power: int, *, reach: int, periodic: bool) 
 
 
 class Coupling(AbstractSpring):
-    """The springs between two bodies."""
+    """The springs between two bodies, along the normal and across it."""
 
-    stretch: Float[Array, "m"]  # g_i at u = 0 [m], shape (m,); zero where nothing is held
-    stiffness: Float[Array, "m"]  # k_i [N/m], shape (m,); zero where nothing is held
+    stretch: Float[Array, "k m"]  # g_i at u = 0 and zeros [m], shape (1 + d, m); zero where nothing is held
+    stiffness: Float[Array, "k m"]  # k_i, and that of each direction across [N/m], shape (1 + d, m); zero likewise
     normal: Float[Array, "m d"]  # n_i [-], shape (m, d)
     patch: Patch  # the nodes over which displacements are averaged, by c_a c_b/(c_a + c_b) of the two bodies
     pair: tuple[int, int] = eqx.field(static=True)  # the numbers of the bodies a and b
 
-    def elongation(self, moved: Displacement) -> Float[Array, "m"]:
-        """n_i · Σ_j q_ij (u_j^a − u_j^b) [m], shape (m,)."""
+    def elongation(self, moved: Displacement) -> Float[Array, "k m"]:
+        """Σ_j q_ij (u_j^a − u_j^b) along n_i, and what is left of it [m], shape (1 + d, m)."""
         layers = moved.nodes.reshape(-1, *self.normal.shape)
         first, second = self.pair
-        return (self.normal * self.patch.mean(layers[first] - layers[second])).sum(axis=1)
+        shift = self.patch.mean(layers[first] - layers[second])
+        along = (self.normal * shift).sum(axis=1)
+        return jnp.concatenate([along[None], (shift - along[:, None] * self.normal).T])
 
-    def spread(self, amount: Float[Array, "m"], size: int) -> Forces:
-        return self._on_both(self.patch.spread(amount[:, None] * self.normal), -1, size)
+    def spread(self, amount: Float[Array, "k m"], size: int) -> Forces:
+        """Nᵀ a, of amounts across the normal that have no part along it."""
+        return self._on_both(self.patch.spread(amount[0][:, None] * self.normal + amount[1:].T), -1, size)
 
     def diagonal(self, stencil: Stencil, size: int) -> Forces:
         del stencil
-        return self._on_both(self.patch.spread_square(self.stiffness[:, None] * self.normal**2), 1, size)
+        square = self.normal**2
+        along = self.stiffness[0][:, None] * square + self.stiffness[1:].T * (1 - square)
+        return self._on_both(self.patch.spread_square(along), 1, size)
 
     def _on_both(self, force: Float[Array, "m d"], sign: int, size: int) -> Forces:
         first, second = self.pair
@@ -165,12 +171,16 @@ class BodyContact(AbstractSpringContact):
     sums to that part of the surface in which there are bodies. The spring feels the mean displacement of the nodes
     around it, and pushes all of them (see `Coupling`).
 
-    Friction is at most μ times the push at each node, against the slip of the two bodies.
+    Friction is at most μ times the push at each node, against the slip of the two bodies. In implicit steps springs f k
+    across the normal, without stretch at the start of the step, take their part in the solve, where f =
+    min(1, μ|g|/(w Δt))² with the gap g and the slip's velocity w at the start. So what rests is held, and what slides
+    is left to the rest of the limit, after the solve. In the step in which slip begins friction may be more.
     """
 
     gap: Float[Array, "m"]  # g_i at the start of the step [m], shape (m,); infinite where a body is not felt
     normal: Float[Array, "m d"]  # n_i [-], from the second body to the first, shape (m, d)
     stiffness: Float[Array, "m"]
+    grip: Float[Array, "m"]  # f [-], shape (m,)
     coefficient: Scalar  # Coulomb coefficient [-]
     dt: Scalar
     share: Scalar
@@ -183,7 +193,17 @@ class BodyContact(AbstractSpringContact):
         return jnp.isfinite(self.gap)
 
     def spread(self, stretch: Array, stiffness: Array) -> Coupling:
+        across = jnp.zeros_like(self.normal.T)
+        stretch = jnp.concatenate([stretch[None], across])
+        stiffness = jnp.concatenate([stiffness[None], across + self.grip * stiffness])
         return Coupling(stretch, stiffness, self.normal, self.patch, self.pair)
+
+    def spring_gap(self, held: ConstrainedNodes) -> Array:
+        return jnp.where(self.near, self._stretched(held)[0], jnp.inf)
+
+    def _stretched(self, held: ConstrainedNodes) -> Float[Array, "k m"]:
+        """The gap, and the slip of the step [m], shape (1 + d, m); zero where a body is not felt."""
+        return self.springs(jnp.ones(self.gap.shape, bool)).stretched(held.moved) / self.share
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """All components of the two bodies' nodes around those that are held."""
@@ -210,24 +230,22 @@ class BodyContact(AbstractSpringContact):
     def friction(
         self, held: ConstrainedNodes, active: Array, residual: NodeVector
     ) -> Callable[[NodeVector], NodeVector]:
-        """Opposite impulses on the two bodies, at most as large as those that stop their slip."""
-        push, count = jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0), len(self.gap)
-        layers = held.nodes.potential.mirror.fold_scalar(jnp.tile(push, len(residual) // count)).reshape(-1, count)
-        limit = self.coefficient * layers[self.pair[0]]
+        """Opposite impulses on the two bodies, at most as large as those that stop the slip that springs have left."""
+        count, (first, second) = len(self.gap), self.pair
+        push = jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0)
+        taken = self.dt * self.stiffness * self.grip * length(self._stretched(held)[1:].T)
+        limit = jnp.tile(jnp.maximum(self.coefficient * push - taken, 0), len(residual) // count)
+        limit = held.nodes.potential.mirror.fold_scalar(limit).reshape(-1, count)[first]
         mass = held.nodes.mass.reshape(-1, count)
-        first, second = (mass[body] for body in self.pair)
-        reduced = series_stiffness(first, second, first + second != 0)
+        reduced = series_stiffness(mass[first], mass[second], mass[first] + mass[second] != 0)
 
         def change(v: NodeVector) -> NodeVector:
             bodies = v.reshape(-1, *self.normal.shape)
-            slip = bodies[self.pair[0]] - bodies[self.pair[1]]
+            slip = bodies[first] - bodies[second]
             slip = slip - self.normal * (self.normal * slip).sum(axis=1, keepdims=True)
-            impulse = (-friction_share(slip, reduced, limit) * reduced)[:, None] * slip
-            change = jnp.zeros_like(bodies)
-            for body, sign, weight in zip(self.pair, (1, -1), (first[:, None], second[:, None]), strict=True):
-                dv = jnp.where(weight > 0, impulse / jnp.where(weight > 0, weight, 1), 0)
-                change = change.at[body].set(sign * dv)
-            return held.nodes.projection.combine(change.reshape(v.shape), 0)
+            stop = (-friction_share(slip, reduced, limit) * reduced)[:, None] * slip
+            impulse = jnp.zeros_like(bodies).at[first].set(stop).at[second].set(-stop)
+            return held.nodes.projection.combine(held.nodes.per_mass(impulse.reshape(v.shape)), 0)
 
         return change
 
@@ -252,14 +270,18 @@ def body_contact(
     away = jnp.minimum(jnp.maximum(first, second), 1)
     felt = both & (depths[0] > _LEAST_DEPTH) & (depths[1] > _LEAST_DEPTH) & (away < 1)
     area = jnp.cos(jnp.pi / 2 * away) ** 2 * (a.part + b.part) * spacing ** (len(normal) - 1)
-    approach = jnp.maximum(-(normal * (a.velocity - b.velocity)).sum(axis=0), 0)
-    stiff, other = (body.modulus + body.density * approach**2 for body in (a, b))
+    leaving = (normal * (a.velocity - b.velocity)).sum(axis=0)
+    stiff, other = (body.modulus + body.density * jnp.maximum(-leaving, 0) ** 2 for body in (a, b))
     modulus, weight = series_stiffness(stiff, other, felt), series_stiffness(a.part, b.part, both)
     weight = images.continued(jnp.tile(jnp.where(both, weight, 0), grid.layers))[: len(weight)]
+    gap, slip = spacing * (first + second), length(a.velocity.T - b.velocity.T - (leaving * normal).T) * dt
+    holds = jnp.maximum(-friction * gap, 0)  # the slip whose springs have all that friction may take of the push
+    slides = felt & (slip > holds)
     return BodyContact(
-        gap=jnp.where(felt, spacing * (first + second), jnp.inf),
+        gap=jnp.where(felt, gap, jnp.inf),
         normal=normal.T,
         stiffness=jnp.where(felt, STIFFNESS * modulus / spacing * area, 0),
+        grip=jnp.where(friction > 0, jnp.where(slides, holds / jnp.where(slides, slip, 1), 1) ** 2, 0),
         coefficient=friction,
         dt=dt,
         share=share,

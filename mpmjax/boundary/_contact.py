@@ -92,6 +92,10 @@ class AbstractNodes(eqx.Module):
     def explicit_velocity(self) -> NodeVector:
         """v* [m/s], shape (n, d)."""
 
+    @abc.abstractmethod
+    def per_mass(self, impulse: NodeVector) -> NodeVector:
+        """An impulse or force divided by the nodes' mass; zero on empty nodes."""
+
 
 N = TypeVar("N", bound=AbstractNodes)
 
@@ -345,8 +349,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             for k, friction in (pair for group in order for pair in group):
                 change = friction(tied.unfold(rubbed))
                 if tied.images:  # impulses on the nodes of a constrained body act on the whole of it
-                    mass, impulse = nodes.mass[:, None], tied.fold(rubbing.nodes.mass[:, None] * change)
-                    change = nodes.projection.combine(jnp.where(mass > 0, impulse / jnp.where(mass > 0, mass, 1), 0), 0)
+                    change = nodes.projection.combine(nodes.per_mass(tied.fold(rubbing.mass[:, None] * change)), 0)
                 rubbed, by_contact[k] = rubbed + change, change
             by_order.append(by_contact)
         total = [reduce(jnp.add, each) / len(orders) for each in zip(*by_order, strict=True)]
