@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 import mpmjax as mpm
-from mpmjax.cli._scene_file import _find_meshes
+from mpmjax.cli._scene_file import _find_files
 from mpmjax.geometry import surface_pieces
 from mpmjax.io import decode
 
@@ -283,7 +283,7 @@ def test_a_scene_file_names_a_mesh_with_its_scale_and_place(suffix, tmp_path):
 
     trimesh.creation.box((500, 500, 500)).export(tmp_path / f"part.{suffix}")
     table = {"kind": "Mesh", "file": f"part.{suffix}", "spacing": 0.125, "scale": 1e-3}
-    _find_meshes([{"region": {"kind": "Placed", "region": table}}], tmp_path)
+    _find_files([{"region": {"kind": "Placed", "region": table}}], tmp_path)
     region = decode(table, mpm.geometry.AbstractRegion)
     exact = mpm.geometry.sample_distance(mpm.Box((-0.25,) * 3, (0.25,) * 3), 0.125)
     np.testing.assert_allclose(region.lower, exact.lower)
