@@ -1,7 +1,7 @@
 """Which gradient operator, which kernel, which description? Errors of displacement and stress where surfaces do not
 follow the grid.
 
-    python benchmarks/gradients.py [--fine] [ring] [vortex] [disks] [column] [tube]
+    python benchmarks/gradients.py [--fine] [ring] [vortex] [disks] [column] [tube] [flat]
 
 Prints rows of docs/accuracy.md, of all problems or of those named. `--fine` adds a grid of twice the resolution.
 
@@ -15,6 +15,7 @@ Prints rows of docs/accuracy.md, of all problems or of those named. `--fine` add
 - tube: thick-walled, under a pressure in its bore, at rest, against G. Lamé in plane strain, on 4, 8 (and 16) cells
   across its wall in the total description: a section of it as a body of revolution, or whole, filled by cells that its
   surfaces cut. Displacement over the largest, radial stress over the pressure, both RMS.
+- flat: a bar that is bent, at rest, and a column under a small load whose end is off nodes, in the total description.
 """
 
 import argparse
@@ -28,6 +29,8 @@ import numpy as np
 import mpmjax as mpm
 from mpmjax.verification import (
     AbstractProblem,
+    BentBar,
+    Column,
     ExpandingRing,
     HenckyColumn,
     TwoDisks,
@@ -141,6 +144,16 @@ def tubes(cells: tuple[int, ...]) -> None:
         row(name, e[:, 0], e[:, 1], cells)
 
 
+def flat(cells: tuple[int, ...]) -> None:
+    """Rows of the bar that is bent and of the column whose end is off nodes, in the total description."""
+    for order, gradient in itertools.product((2, 3), (SPLINE, MLS)):
+        chosen = {"kernel": mpm.BSpline(order), "gradient": gradient}
+        bar = np.array([BentBar().errors(n, mpm.ClampPlane(0, 0.0), **chosen) for n in cells])
+        end = np.array([Column(shift=0.3).errors(n, description=TOTAL, **chosen) for n in cells])
+        for name, e in (("bent bar", bar), ("column's end", end)):
+            row(f"{name}: {NAMES[gradient]}, {'quadratic' if order == 2 else 'cubic'}", e[:, 0], e[:, 1], cells)
+
+
 def disks(cells: tuple[int, ...]) -> None:
     """What is left of the kinetic energy when the disks have parted, and the largest growth of energy."""
     for fitted in (False, True):
@@ -165,17 +178,17 @@ def disks(cells: tuple[int, ...]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fine", action="store_true", help="a grid of twice the resolution besides")
-    parser.add_argument("problems", nargs="*", help="ring, vortex, disks, column, tube; default: all")
+    parser.add_argument("problems", nargs="*", help="ring, vortex, disks, column, tube, flat; default: all")
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    unknown = set(given.problems) - {"ring", "vortex", "disks", "column", "tube"}
+    unknown = set(given.problems) - {"ring", "vortex", "disks", "column", "tube", "flat"}
     if unknown:
         parser.error(f"no such problem: {', '.join(sorted(unknown))}")
 
     def grids(*cells: int) -> tuple[int, ...]:
         return (*cells, 2 * cells[-1]) if given.fine else cells
 
-    for problem in given.problems or ("ring", "vortex", "disks", "column", "tube"):
+    for problem in given.problems or ("ring", "vortex", "disks", "column", "tube", "flat"):
         match problem:
             case "ring":
                 moving("ring", ExpandingRing(), 0.1, 1e7 * 0.25, grids(20, 40), choices())
@@ -185,6 +198,8 @@ def main() -> None:
                 disks(grids(20, 40))
             case "tube":
                 tubes(grids(4, 8))
+            case "flat":
+                flat(grids(4, 8))
             case _:
                 column(grids(16, 32))
 
