@@ -245,9 +245,9 @@ class ContactPlane(AbstractPlane):
     Second order in the spacing while contact lasts without friction; first order where friction shears the material at
     the wall (the mirrored tangential velocity has no slope there), and in the moment of touching and leaving.
 
-    A column is held while a third of the faces around it that are near is behind the plane, or less than a hundredth
-    of a spacing before it. What it moves with when it is first held is lost, so an impact returns less than from a
-    `SeparatingBox`, which is the better wall for a bounce.
+    A column is held while a third of the faces around it that are near, of what yields or flows any, is behind the
+    plane, or less than a hundredth of a spacing before it. What it moves with when it is first held is lost, so an
+    impact returns less than from a `SeparatingBox`, which is the better wall for a bounce.
 
     *When it breaks*: as a `SymmetryPlane`. PIC and FLIP carry no velocity gradient to the grid, so with them a fast
     stretch of what touches the wall is taken for leaving it; APIC knows better. Half-way between nodes a plane is not
@@ -285,9 +285,9 @@ class ContactPlane(AbstractPlane):
         self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
     ) -> tuple[AbstractContact, ...]:
         """A mirror in the columns around which a third of the faces is shut, by the kernel's weights, of those less
-        than half a particle before the plane; of what flows, or is far behind it, any. In implicit steps, which may
-        close much of a gap at once, faces before the plane are pushed as by a `SeparatingBox` in the step that would
-        bring them behind it."""
+        than half a particle before the plane; of what yields or flows, or is far behind it, any. In implicit steps,
+        which may close much of a gap at once, faces before the plane are pushed as by a `SeparatingBox` in the step
+        that would bring them behind it."""
         del t, dt
         assert faces is not None  # as it `sees_faces`
         normal = jnp.zeros_like(faces.x.T).at[self.axis].set(self.inward)
@@ -295,7 +295,7 @@ class ContactPlane(AbstractPlane):
         landing = surface_contact(Surface(distance, normal, self.friction, axis=self.axis), faces)
         shut = landing.gap <= SHUT * faces.spacing
         # a curved face is felt where it is, and not a kernel beside its contact; twice the gap: the half-width before
-        before = (2 * landing.gap < distance) & ~faces.flowing
+        before = (2 * landing.gap < distance) & ~faces.round
         votes = jnp.where(landing.gap < -FAR * faces.spacing, 100.0, jnp.where(shut, 2.0, jnp.where(before, -1.0, 0.0)))
         around = scatter(faces.stencil, votes.astype(faces.x.dtype), None, grid.size)
         order, position = len(faces.stencil.basis.knots) - 1, jax.lax.stop_gradient(self.position)  # the lattice goes

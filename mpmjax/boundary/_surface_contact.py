@@ -97,7 +97,15 @@ class Faces(eqx.Module):
     @property
     def flowing(self) -> Bool[np.ndarray, "p"]:
         """The particles of materials that flow, shape (p,)."""
-        return np.repeat([shape.flows for shape in self.shapes], [len(shape.half) for shape in self.shapes])
+        return self._each([shape.flows for shape in self.shapes])
+
+    @property
+    def round(self) -> Bool[np.ndarray, "p"]:
+        """The particles whose faces are known by their volume alone, as they yield or flow, shape (p,)."""
+        return self._each([shape.deformation.ndim == 1 for shape in self.shapes])
+
+    def _each(self, of_materials: list[bool]) -> Bool[np.ndarray, "p"]:
+        return np.repeat(of_materials, [len(shape.half) for shape in self.shapes])
 
     @property
     def flowing_volume(self) -> Float[Array, "p"]:
