@@ -13,10 +13,11 @@ is that of the active set, and does not exist where the set changes. An explicit
 with it which gaps are shut: it needs no sweep.
 
 Friction is an impulse at the places held, applied after the solve against the slip and at most μ times the normal
-impulse (Coulomb). It is not part of the implicit system, so it lags by the elastic response of one step. An integrator
-of several stages may let it act after each (see `TRBDF2`). It takes the share min(1, limit/(m ‖s‖)) of the slip s.
-Where that is 1 the node sticks, and the derivative is that of sticking: d(s after)/ds = 0, at rest too, where s = 0. At
-the kink, limit = m ‖s‖, it is the one on the side of sticking. Where nothing pushes there is none of either.
+impulse (Coulomb). It is not part of the implicit system, so it lags by the elastic response of one step (between bodies
+what sticks is: see `BodyContact`). An integrator of several stages may let it act after each (see `TRBDF2`). It takes
+the share min(1, limit/(m ‖s‖)) of the slip s. Where that is 1 the node sticks, and the derivative is that of sticking:
+d(s after)/ds = 0, at rest too, where s = 0. At the kink, limit = m ‖s‖, it is the one on the side of sticking. Where
+nothing pushes there is none of either.
 """
 
 import abc
@@ -116,12 +117,10 @@ class AbstractContact(eqx.Module):
     def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
         """Whether `likely_held` is the active set of a step, whose force is that at its start if it is explicit.
         Default: it may not be."""
-        del nodes, explicit
         return False
 
     def images(self, active: Array) -> tuple[WallImage, ...]:
         """The mirrors that stand in the places held. Default: none."""
-        del active
         return ()
 
     @abc.abstractmethod
@@ -149,17 +148,14 @@ class AbstractContact(eqx.Module):
     ) -> Callable[[NodeVector], NodeVector] | None:
         """The change of velocity by friction [m/s], shape (n, d), on true nodes, as a function of the velocity v (see
         `friction_change`). Default: None, no friction."""
-        del held, active, residual
         return None
 
     def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """The components of velocity that are zero at the places held, shape (n, d). Default: none."""
-        del active
         return jnp.zeros(shape, bool)
 
     def springs(self, active: Array) -> AbstractTerm | None:
         """The springs of the places held. Default: None, without any."""
-        del active
         return None
 
     def spring_impulse(self, held: "ConstrainedNodes", active: Array) -> NodeVector | None:
@@ -183,7 +179,6 @@ class AbstractContact(eqx.Module):
             mass: masses of the particles [kg], shape (p,).
             steepness: A [1/m²] of each particle (see `stable_dt`).
         """
-        del contacts, nodal_mass, mass, steepness
         return 0.0
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
@@ -215,7 +210,6 @@ class AbstractSpringContact(AbstractContact):
     """θ; 1 where forces are those at the start of the step."""
 
     def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
-        del nodes
         return explicit
 
     @property
@@ -238,12 +232,10 @@ class AbstractSpringContact(AbstractContact):
 
     def gap_velocity(self, held: "ConstrainedNodes", v: NodeVector) -> Array:
         """The gap over the step [m/s]."""
-        del v
         return self.spring_gap(held) / self.dt
 
     def normal_impulse(self, held: "ConstrainedNodes", residual: NodeVector) -> Array:
         """The impulse −Δt k g of each spring [kg m/s]; zero at places that are not near."""
-        del residual
         return -self.dt * self.stiffness * jnp.where(self.near, self.spring_gap(held), 0)
 
     def rounding(self, held: "ConstrainedNodes", noise: Array) -> tuple[Array, Array]:
