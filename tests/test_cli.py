@@ -333,7 +333,7 @@ def test_a_scene_of_python_is_a_scene_file(tmp_path):
     grid = mpm.Grid((12, 14), 0.1, origin=(-3, -3))
     lower, upper = mpm.Box((0.0, 0.0), (0.3, 0.3)), mpm.Box((0.0, 0.35), (0.3, 0.6))
     particles = mpm.join(*(mpm.fill(box, grid, particles_per_cell=4, density=1e3) for box in (lower, upper)))
-    laws = {"soft": mpm.NeoHookean(1e5, 0.3), 'clay \\ "wet"': mpm.VonMises(2e5, 0.3, 1e2, 0.0)}
+    laws = {"soft": mpm.NeoHookean(1e5, 0.3), 'clay 😀 \\ "wet"': mpm.VonMises(2e5, 0.3, 1e2, 0.0)}
     boundary = mpm.SlipBox((-0.2, -np.inf), (0.6, np.inf)), mpm.Grip(lower, mpm.Motion((0.0, 1.0), ((0, 0), (0.1, 0))))
     loads = mpm.Traction(mpm.Patch(upper, within=mpm.Box((-1.0, 0.55), (1.0, 0.7))), (0.0, 9.0))
     scene = mpm.attach(mpm.Scene(grid, laws, gravity=(0.0, -9.81), boundary=boundary, loads=loads), particles)

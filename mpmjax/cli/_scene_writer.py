@@ -62,9 +62,9 @@ def save_scene(
         table["material"] = dict(zip(scene.names, table["material"], strict=True))
     run = {"t1": encode(t1), "dt": encode(dt), "method": _chosen(encode(method)), "save_every": save_every}
     table |= {"particles": {"file": start.name}, "run": run | {"precision": str(dtype)}}
-    save(start, run_to(problem, initial_state(problem), 0, no_steps(dtype)))
-    with replacing(path) as aside:
+    with replacing(path) as aside:  # which is put in place when the particles are on the disk
         aside.write_text("\n".join([*_lines(table), ""]), encoding="utf-8")
+        save(start, run_to(problem, initial_state(problem), 0, no_steps(dtype)))
 
 
 def _chosen(data: Any) -> Any:
@@ -83,7 +83,7 @@ def _lines(table: dict[str, Any], owner: str = "") -> list[str]:
     """The lines of a TOML table: its values, then the tables in it under their headers."""
     lines, within = [], []
     for key, value in table.items():
-        header = f"{owner}{key}" if re.fullmatch(r"[\w-]+", key, re.ASCII) else f"{owner}{json.dumps(key)}"
+        header = f"{owner}{key}" if re.fullmatch(r"[\w-]+", key, re.ASCII) else f"{owner}{_text(key)}"
         if isinstance(value, dict):
             within += ["", f"[{header}]", *_lines(value, f"{header}.")]
         elif isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
@@ -99,4 +99,4 @@ def _text(value: Any) -> str:
         return "{ " + ", ".join(f"{key} = {_text(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list):
         return "[" + ", ".join(map(_text, value)) + "]"
-    return json.dumps(value) if isinstance(value, (str, bool)) else repr(value)
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, (str, bool)) else repr(value)
