@@ -1,5 +1,7 @@
 """Contact: walls that push but do not pull, and Coulomb friction."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -585,3 +587,15 @@ def test_friction_on_a_surface_stops_slip_and_nothing_that_is_held():
         slip = along * (along @ (V[k] - moving[k])) / np.linalg.norm(along)
         np.testing.assert_allclose(change[k], -0.05 / 2 * slip / np.linalg.norm(slip), atol=1e-15)
     assert (np.asarray(change)[2] == 0).all()
+
+
+def test_a_face_far_behind_a_contact_plane_is_held_whatever_is_beside_it():
+    """One particle a fifth of a spacing behind it, its neighbours a tenth before it, all on the way down: it stops,
+    though more than two thirds of the faces around it do not touch."""
+    grid = mpm.Grid((12, 12), 0.1, origin=(-3, -3))
+    block = mpm.fill(mpm.Box((0.0, 0.01), (0.5, 0.31)), grid, density=1e3)
+    deep = int(np.abs(np.asarray(block.x) - [0.275, 0.035]).sum(axis=1).argmin())
+    falling = dataclasses.replace(block, x=block.x.at[deep, 1].set(0.005), v=block.v.at[:, 1].set(-0.1))
+    scene = mpm.Scene(grid, mpm.NeoHookean(1e4, 0.3), boundary=mpm.ContactPlane(1, 0.0))
+    end, _ = mpm.step(scene, mpm.prepare(scene, falling), 0.0, 1e-3)
+    assert end.v[deep, 1] > -0.01
