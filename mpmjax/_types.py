@@ -42,11 +42,10 @@ else:  # aliases with names, which signatures show in place of their members
     """A point or vector of d numbers."""
 
 
-class MayBeInfinite:
-    """A mark of annotations: the numbers may be infinite. Without it those in files must be finite."""
+MAY_BE_INFINITE = object()
+"""A mark of annotations: the numbers may be infinite. Without it those in files must be finite."""
 
-
-Corner = Annotated[Point, MayBeInfinite]
+Corner = Annotated[Point, MAY_BE_INFINITE]
 """A corner of a box, with an infinite number in each direction in which the box has no end."""
 
 Mask = Bool[Array, "n d"]
@@ -68,6 +67,7 @@ Compliance = Float[Array, "s s *p"]
 Indices = Int[Array, "k p"]
 
 __all__ = [
+    "MAY_BE_INFINITE",
     "Array",
     "Bool",
     "Compliance",
@@ -78,7 +78,6 @@ __all__ = [
     "Int",
     "Mask",
     "Matrix",
-    "MayBeInfinite",
     "NodeScalar",
     "NodeVector",
     "ParticleMatrix",

@@ -8,7 +8,7 @@ bodies share a node, the rules of `combined_conditions` apply.
 """
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import ColliderConditions, Conditions, Slide, no_conditions
 from mpmjax.boundary._plane_contact import FlatWall
 from mpmjax.boundary._surface_contact import Surface, refuse_contact
-from mpmjax.checks import canonical, require, require_between, require_fields
+from mpmjax.checks import between, canonical, require, require_fields
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, length, still
 
@@ -204,12 +204,8 @@ class SeparatingCollider(AbstractCollider):
 
     shape: AbstractRegion
     motion: AbstractMotion | None = None
-    friction: Scalar = 0.0
+    friction: Annotated[Scalar, between(0, 1e6)] = 0.0
     pushes: ClassVar[bool] = True
-
-    def __check_init__(self):
-        require_fields(self)
-        require_between("SeparatingCollider's friction", self.friction, 0, 1e6)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """None on nodes: it acts on faces. Its pivot, for torques."""

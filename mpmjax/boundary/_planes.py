@@ -1,7 +1,7 @@
 """Symmetry, clamp and contact planes, beyond which nodes are mirror images."""
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._plane_contact import SHUT, plane_contact
 from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
-from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
+from mpmjax.checks import between, require, require_fields, require_finite, require_that
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, Motion
 from mpmjax.potential import Image, MirrorPlace, mirror_image, wall_image
@@ -35,6 +35,7 @@ class AbstractPlane(AbstractBoundary):
     """The box that is the same wall anywhere, to first order."""
 
     def __check_init__(self):
+        require_fields(self)
         name = type(self).__name__
         require_finite(f"{name}'s position", self.position)
         require(self.axis in (0, 1, 2), f"{name}'s axis must be 0, 1 or 2, got {self.axis}.")
@@ -138,9 +139,6 @@ class SymmetryPlane(AbstractMovingPlane):
     motion: Motion | None = None
     plain_box: ClassVar[str] = "SlipBox"
 
-    def __check_init__(self):
-        require_fields(self)
-
     def displacement(self, t: Scalar) -> Scalar:
         return 0.0 if self.motion is None else self.motion.at(t)[self.axis]
 
@@ -189,9 +187,6 @@ class ClampPlane(AbstractMovingPlane):
     motion: Motion | AbstractMotion | None = None
     plain_box: ClassVar[str] = "Grip"
     meets_constraints: ClassVar[bool] = False
-
-    def __check_init__(self):
-        require_fields(self)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """A motion needs the total description."""
@@ -264,14 +259,10 @@ class ContactPlane(AbstractPlane):
     axis: int = eqx.field(static=True)
     position: Scalar
     keep: str = eqx.field(static=True, default="above")
-    friction: Scalar = 0.0
+    friction: Annotated[Scalar, between(0, 1e6)] = 0.0
     plain_box: ClassVar[str] = "SeparatingBox"
     sees_faces: ClassVar[bool] = True
     meets_constraints: ClassVar[bool] = False
-
-    def __check_init__(self):
-        require_fields(self)
-        require_between("ContactPlane's friction", self.friction, 0, 1e6)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         del spacing, t, dt, reference

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from functools import reduce
 from itertools import chain
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
 from mpmjax.boundary._surface_contact import SIGNS, Faces, Surface, refuse_contact, surface_contact
-from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
+from mpmjax.checks import between, coordinates, require, require_fields, require_that
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import Motion
 
@@ -29,6 +29,7 @@ class AbstractBox(AbstractBoundary):
     """Position of the upper wall in each direction [m], (d,); inf for none."""
 
     def __check_init__(self):
+        require_fields(self)
         name = type(self).__name__
         require(
             coordinates(f"{name}'s lower corner", self.lower) == coordinates(f"{name}'s upper corner", self.upper),
@@ -181,12 +182,8 @@ class SeparatingBox(AbstractBox):
 
     lower: Corner
     upper: Corner
-    friction: Scalar = 0.0
+    friction: Annotated[Scalar, between(0, 1e6)] = 0.0
     pushes: ClassVar[bool] = True
-
-    def __check_init__(self):
-        require_fields(self)
-        require_between("SeparatingBox's friction", self.friction, 0, 1e6)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         del spacing, t, dt, reference

@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray
 
-from mpmjax._types import MayBeInfinite
 from mpmjax.checks._values import shortened
 
 Function = TypeVar("Function", bound=Callable)
@@ -65,9 +64,10 @@ def checked(function: Function) -> Function:
 
 
 def require_fields(module: eqx.Module) -> None:
-    """Check that every field of a module is of the kind that its annotation names, and can fix a program if it is
-    static."""
-    for name, hint, static in _hints(type(module)):
+    """Check that every field of a module is of the kind that its annotation names, can fix a program if it is static,
+    and has the values that marks ask for. They are functions of a name and a value that raise `ValueError`s, and a unit
+    for the name: `Annotated[PerParticle, positive, "Pa"]`. None has no values."""
+    for name, hint, static, marks in _hints(type(module)):
         value, what = getattr(module, name), f"{type(module).__name__}'s {name}"
         require_kind(what, value, hint)
         try:
@@ -75,11 +75,14 @@ def require_fields(module: eqx.Module) -> None:
         except TypeError:
             shown = shortened(repr(value))
             raise ValueError(f"{what} fixes a program: give a known number or a tuple, got {shown}.") from None
+        what += "".join(f" [{unit}]" for unit in marks if isinstance(unit, str))
+        for check in (mark for mark in marks if callable(mark) and value is not None):
+            check(what, value)
 
 
 @cache
-def _hints(module: type) -> tuple[tuple[str, Any, bool], ...]:
-    return tuple((f.name, f.type, f.metadata.get("static", False)) for f in fields(module))
+def _hints(module: type) -> tuple[tuple[str, Any, bool, list[Any]], ...]:
+    return tuple((f.name, f.type, f.metadata.get("static", False), marks_of(f.type)) for f in fields(module))
 
 
 def require_kind(name: str, value: Any, hint: Any) -> None:
@@ -100,13 +103,13 @@ def alternatives(hint: Any) -> list[Any]:
     return [hint]
 
 
-def may_be_infinite(hint: Any) -> bool:
-    """Whether an annotation is marked as one of numbers that may be infinite, or a member of its union is."""
+def marks_of(hint: Any) -> list[Any]:
+    """The marks of an annotation (see `Annotated`), and those of the members of its union."""
     hint = getattr(hint, "__value__", hint)
     if get_origin(hint) is Annotated:
         inner, *marks = get_args(hint)
-        return MayBeInfinite in marks or may_be_infinite(inner)
-    return get_origin(hint) in (typing.Union, UnionType) and any(may_be_infinite(member) for member in get_args(hint))
+        return [*marks_of(inner), *marks]
+    return [m for a in get_args(hint) for m in marks_of(a)] if get_origin(hint) in (typing.Union, UnionType) else []
 
 
 def is_class(hint: Any, base: type) -> bool:

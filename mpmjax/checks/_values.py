@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -197,10 +198,18 @@ def require_between(name: str, value: Any, lower: float | int, upper: float | in
     require_that(f"{name} must be {words}", inside, value)
 
 
-def require_moduli(name: str, youngs_modulus: Any, poisson_ratio: Any) -> None:
-    """E must be greater than zero and ν strictly between −1 and 0.5."""
-    require_positive(f"{name}'s youngs_modulus [Pa]", youngs_modulus)
-    require_between(f"{name}'s poisson_ratio", poisson_ratio, -1, 0.5, open_ends=True)
+finite, positive, tolerance = require_finite, require_positive, require_tolerance
+"""Marks of annotations, see `require_fields`, as those of the two functions below."""
+
+
+def between(lower: float | int, upper: float | int, *, open_ends: bool = False) -> Callable[[str, Any], None]:
+    """The mark of numbers that `require_between` takes."""
+    return partial(require_between, lower=lower, upper=upper, open_ends=open_ends)
+
+
+def whole(least: int) -> Callable[[str, Any], int]:
+    """The mark of numbers that `require_whole` takes."""
+    return partial(require_whole, least=least)
 
 
 def canonical(tree: Any, dtype: Any) -> Any:

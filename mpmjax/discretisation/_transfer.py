@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial, reduce
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.autodiff import custom_derivative
-from mpmjax.checks import require_between, require_fields
+from mpmjax.checks import between, require_fields
 from mpmjax.discretisation._fused_sums import average
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._native_sums import call_g2p, call_p2g
@@ -123,12 +123,9 @@ class FLIP(AbstractTransfer):
         alpha: share of FLIP, from 0 (PIC) to 1.
     """
 
-    alpha: Scalar = 0.99
+    alpha: Annotated[Scalar, between(0, 1)] = 0.99
     needs_change: ClassVar[bool] = True
-
-    def __check_init__(self):
-        require_fields(self)
-        require_between("FLIP's alpha", self.alpha, 0, 1)
+    __check_init__ = require_fields
 
     def velocity(self, v: Float[Array, "d p"], new: Gathered, change: Gathered | None) -> Float[Array, "d p"]:
         assert change is not None

@@ -1,6 +1,6 @@
 """Laws with an active stress along fibres, as of muscles, whose activation a control sets."""
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
 import jax
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix, PerParticle, Scalar
-from mpmjax.checks import require, require_fields, require_finite, require_positive
+from mpmjax.checks import finite, positive, require, require_fields
 from mpmjax.material import AbstractInelastic, AbstractMaterial, MatrixDifferential
 
 _TURNED = (1 + 2**0.5) / 2
@@ -49,16 +49,13 @@ class Active(AbstractInelastic):
     allows_total: ClassVar[bool] = True  # its return map changes nothing
     relaxes_stress: ClassVar[bool] = False
     law: AbstractMaterial
-    strength: PerParticle
-    angle: PerParticle = 0.0
-    elevation: PerParticle = 0.0
+    strength: Annotated[PerParticle, positive, "Pa"]
+    angle: Annotated[PerParticle, finite, "rad"] = 0.0
+    elevation: Annotated[PerParticle, finite, "rad"] = 0.0
 
     def __check_init__(self):
         require_fields(self)
         require(self.law.measure.axes == 2, f"Active takes an elastic law of F, got {self.law.title()}.")
-        require_positive("Active's strength [Pa]", self.strength)
-        require_finite("Active's angle [rad]", self.angle)
-        require_finite("Active's elevation [rad]", self.elevation)
 
     def initial_history(self, F: Deformation) -> Activation:
         return Activation(jnp.zeros(F.shape[2:], F.dtype))

@@ -1,7 +1,7 @@
 """Rigid bodies: the law that brings them, and from particles to the two nodes that move each body, and back."""
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Int, Mask, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import AbstractNodes, OwnedCouple
-from mpmjax.checks import as_plain, require, require_fields, require_positive
+from mpmjax.checks import as_plain, positive, require, require_fields
 from mpmjax.geometry import RigidBody, moment, rigid_body, rotation_of, rotation_of_chords, spinning, turn
 from mpmjax.material import AbstractMaterial
 from mpmjax.potential import Image, Mirror
@@ -41,13 +41,12 @@ class Rigid(AbstractMaterial):
     """
 
     allows_averaged_volume: ClassVar[bool] = False  # its volume does not change
-    modulus: Scalar
+    modulus: Annotated[Scalar, positive, "Pa"]
     free: tuple[bool, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
     turns: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
         require_fields(self)
-        require_positive("Rigid's modulus [Pa]", self.modulus)
         require(
             self.free is None or len(self.free) in (1, 2, 3),
             f"Rigid's free directions must be one bool for each of the scene's, got {self.free}.",

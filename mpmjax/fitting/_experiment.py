@@ -2,14 +2,14 @@
 
 import abc
 import itertools
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import as_floats, canonical, checked, require, require_fields, require_finite, require_positive
+from mpmjax.checks import as_floats, canonical, checked, finite, positive, require, require_fields, require_positive
 from mpmjax.fitting._uncertainty import Prediction
 from mpmjax.simulation import Run, number_of_steps, simulate
 from mpmjax.state import Particles, Scene, prepare
@@ -32,17 +32,13 @@ class Shown(eqx.Module):
     x: str = eqx.field(static=True, default="")
     y: str = eqx.field(static=True, default="")
     columns: tuple[str, ...] = eqx.field(static=True, default=())
-    x_unit: Scalar = eqx.field(converter=as_floats, default=1.0)
-    unit: Scalar = eqx.field(converter=as_floats, default=1.0)
-    path: Float[np.ndarray, "2 m"] | None = eqx.field(converter=as_floats, default=None)
+    x_unit: Annotated[Scalar, positive] = eqx.field(converter=as_floats, default=1.0)
+    unit: Annotated[Scalar, finite] = eqx.field(converter=as_floats, default=1.0)
+    path: Annotated[Float[np.ndarray, "2 m"], finite] | None = eqx.field(converter=as_floats, default=None)
 
     def __check_init__(self):
         require_fields(self)
-        require_finite("Shown's unit", self.unit)
         require(np.asarray(self.unit) != 0, "Shown's unit must not be zero, got 0: give what one of it is in SI units.")
-        require_positive("Shown's x_unit", self.x_unit)
-        if self.path is not None:
-            require_finite("Shown's path", self.path)
 
     def along(self, x: np.ndarray) -> np.ndarray:
         """The abscissae of pictures, from those of the observation."""

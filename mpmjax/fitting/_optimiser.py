@@ -3,7 +3,7 @@ L-BFGS and Adam of optax by the gradient alone."""
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import optax
 import optimistix
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
-from mpmjax.checks import as_floats, require_fields, require_positive, require_tolerance, require_whole
+from mpmjax.checks import as_floats, positive, require_fields, require_positive, tolerance, whole
 from mpmjax.fitting._evaluation import Evaluated, parts_kept
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._search import AbstractOptimiser, Evaluation
@@ -39,14 +39,9 @@ class LevenbergMarquardt(AbstractOptimiser):
             measured number. Default: the cheaper one.
     """
 
-    rtol: Scalar = 1e-6
-    max_steps: int = eqx.field(static=True, default=300)
+    rtol: Annotated[Scalar, tolerance] = 1e-6
+    max_steps: Annotated[int, whole(1)] = eqx.field(static=True, default=300)
     mode: Literal["forward", "reverse"] | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self):
-        require_fields(self)
-        require_tolerance("LevenbergMarquardt's rtol", self.rtol)
-        require_whole("LevenbergMarquardt's max_steps", self.max_steps, 1)
 
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Any:
         if parts_kept(problem, 1 + problem.size) is not None:
@@ -182,16 +177,10 @@ class LBFGS(AbstractOptimiser):
         line_search: most simulations of a line search.
     """
 
-    rtol: Scalar = eqx.field(converter=as_floats, default=1e-3)
-    max_steps: int = eqx.field(static=True, default=200)
-    memory: int = eqx.field(static=True, default=20)
-    line_search: int = eqx.field(static=True, default=20)
-
-    def __check_init__(self):
-        require_fields(self)
-        require_positive("LBFGS's rtol", self.rtol)
-        for name in ("max_steps", "memory", "line_search"):
-            require_whole(f"LBFGS's {name}", getattr(self, name), 1)
+    rtol: Annotated[Scalar, positive] = eqx.field(converter=as_floats, default=1e-3)
+    max_steps: Annotated[int, whole(1)] = eqx.field(static=True, default=200)
+    memory: Annotated[int, whole(1)] = eqx.field(static=True, default=20)
+    line_search: Annotated[int, whole(1)] = eqx.field(static=True, default=20)
 
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "LBFGSState":
         del problem, sigmas
@@ -304,15 +293,12 @@ class Adam(AbstractOptimiser):
     """
 
     learning_rate: Scalar | Callable[[Any], Any] = eqx.field(converter=as_floats, default=0.05)
-    atol: Scalar = eqx.field(converter=as_floats, default=1e-4)
-    max_steps: int = eqx.field(static=True, default=500)
-    patience: int = eqx.field(static=True, default=10)
+    atol: Annotated[Scalar, positive] = eqx.field(converter=as_floats, default=1e-4)
+    max_steps: Annotated[int, whole(1)] = eqx.field(static=True, default=500)
+    patience: Annotated[int, whole(1)] = eqx.field(static=True, default=10)
 
     def __check_init__(self):
         require_fields(self)
-        require_positive("Adam's atol", self.atol)
-        for name in ("max_steps", "patience"):
-            require_whole(f"Adam's {name}", getattr(self, name), 1)
         require_positive("Adam's learning_rate", self.rate(0))
 
     def rate(self, number: Any) -> Any:

@@ -4,7 +4,7 @@ import abc
 from collections.abc import Callable
 from functools import partial
 from operator import attrgetter
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -17,6 +17,8 @@ from mpmjax.checks import (
     as_plain,
     canonical,
     checked,
+    finite,
+    positive,
     require,
     require_fields,
     require_finite,
@@ -32,6 +34,8 @@ Start = Scalar | Value | Float[np.ndarray, "..."] | tuple | list
 
 class AbstractPrior(eqx.Module):
     """Prior knowledge of a parameter, as residuals beside those of the data."""
+
+    __check_init__ = require_fields
 
     @abc.abstractmethod
     def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
@@ -62,13 +66,8 @@ class Gaussian(AbstractPrior):
         mean, sigma: expected value and standard deviation, in the parameter's unit, one number or one for each entry.
     """
 
-    mean: Float[np.ndarray, "..."] = eqx.field(converter=as_floats)
-    sigma: Float[np.ndarray, "..."] = eqx.field(converter=as_floats)
-
-    def __check_init__(self):
-        require_fields(self)
-        require_finite("Gaussian's mean", self.mean)
-        require_positive("Gaussian's sigma", self.sigma)
+    mean: Annotated[Float[np.ndarray, "..."], finite] = eqx.field(converter=as_floats)
+    sigma: Annotated[Float[np.ndarray, "..."], positive] = eqx.field(converter=as_floats)
 
     def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
         """(value − mean)/σ."""
@@ -103,14 +102,8 @@ class Smooth(AbstractPrior):
             jump stays one, for bodies made of regions. Default: none.
     """
 
-    sigma: Scalar = eqx.field(converter=as_floats)
-    robust: Scalar | None = eqx.field(converter=as_floats, default=None)
-
-    def __check_init__(self):
-        require_fields(self)
-        require_positive("Smooth's sigma", self.sigma)
-        if self.robust is not None:
-            require_positive("Smooth's robust limit", self.robust)
+    sigma: Annotated[Scalar, positive] = eqx.field(converter=as_floats)
+    robust: Annotated[Scalar, positive] | None = eqx.field(converter=as_floats, default=None)
 
     def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
         """(f_{i+1} − f_i)/σ along each axis."""
@@ -242,12 +235,7 @@ class Unbounded(_PlainParameter):
         scale: a change that is large but not absurd. Default: the size of the first guess, or one if that is zero.
     """
 
-    scale: Scalar | None = eqx.field(default=None, kw_only=True)
-
-    def __check_init__(self):
-        require_fields(self)
-        if self.scale is not None:
-            require_positive("Unbounded's scale", self.scale)
+    scale: Annotated[Scalar, positive] | None = eqx.field(default=None, kw_only=True)
 
     def value(self, start: Value, z: Value) -> Value:
         return start + self._scale(start) * z

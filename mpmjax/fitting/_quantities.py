@@ -96,9 +96,7 @@ class Extent(eqx.Module):
     axis: int = eqx.field(static=True)  # the direction
     side: Literal["upper", "lower"] = eqx.field(static=True, default="upper")
     """"upper" for the largest coordinate, "lower" for the smallest."""
-
-    def __check_init__(self):
-        require_fields(self)
+    __check_init__ = require_fields
 
     def __call__(self, scene: Scene, particles: Particles) -> Float[Array, ""]:
         """The coordinate [m]."""
@@ -160,9 +158,7 @@ class Density(eqx.Module):
     """
 
     grid: Grid  # the lattice; the picture ends with it
-
-    def __check_init__(self):
-        require_fields(self)
+    __check_init__ = require_fields
 
     def __call__(self, scene: Scene, particles: Particles) -> Array:
         """The density [kg/m^d], of the grid's shape."""

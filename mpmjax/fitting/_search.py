@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float
-from mpmjax.checks import require, require_whole
+from mpmjax.checks import require, require_fields, require_whole
 from mpmjax.fitting._evaluation import evaluated, parts_kept
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 from mpmjax.simulation import Run
@@ -38,6 +38,7 @@ class AbstractOptimiser(eqx.Module):
     """
 
     max_steps: eqx.AbstractVar[int]  # most iterations
+    __check_init__ = require_fields
 
     @abc.abstractmethod
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Any:

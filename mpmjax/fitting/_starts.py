@@ -3,14 +3,14 @@
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, Scalar
-from mpmjax.checks import require, require_between, require_fields, require_finite, require_whole
+from mpmjax.checks import between, require, require_fields, require_finite, whole
 from mpmjax.fitting._estimate import table
 from mpmjax.fitting._evaluation import costs_at
 from mpmjax.fitting._parameter import AbstractParameter
@@ -59,21 +59,14 @@ class Starts(eqx.Module):
             its bounds.
     """
 
-    count: int = 64
-    fraction: Scalar = 0.375
+    count: Annotated[int, whole(1)] = 64
+    fraction: Annotated[Scalar, between(0, 1)] = 0.375
     ranges: dict[str, tuple[float, float]] | None = eqx.field(default=None, kw_only=True)
     points: tuple[dict[str, Any], ...] = eqx.field(default=(), kw_only=True)
     if_needed: bool = eqx.field(default=False, kw_only=True)
-    seed: int = eqx.field(default=0, kw_only=True)
-    batch: int | None = eqx.field(default=None, kw_only=True)
-
-    def __check_init__(self):
-        require_fields(self)
-        require_whole("starts", self.count, 1)
-        require_between("fraction", self.fraction, 0, 1)
-        require_whole("seed", self.seed, 0)
-        if self.batch is not None:
-            require_whole("batch", self.batch, 1)
+    seed: Annotated[int, whole(0)] = eqx.field(default=0, kw_only=True)
+    batch: Annotated[int, whole(1)] | None = eqx.field(default=None, kw_only=True)
+    __check_init__ = require_fields
 
 
 def as_starts(starts: int | Literal["auto"] | Starts) -> Starts:

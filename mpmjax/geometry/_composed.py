@@ -95,9 +95,7 @@ class Complement(AbstractRegion):
     """
 
     region: AbstractRegion
-
-    def __check_init__(self):
-        require_fields(self)
+    __check_init__ = require_fields
 
     @property
     def dim(self) -> int:

@@ -1,7 +1,7 @@
 """Newton's method for the nodal problems."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
-from mpmjax.checks import require, require_fields, require_tolerance
+from mpmjax.checks import require, require_fields, tolerance
 from mpmjax.implicit._solve_info import SolveInfo, require_solver
 from mpmjax.implicit._solver import DEFAULT_RTOL, NEARLY_CONVERGED, NEGLIGIBLE_CHANGE, ConjugateResidual, solve_linear
 from mpmjax.implicit._stage import AbstractStageSolver, StageProblem
@@ -53,15 +53,12 @@ class Newton(AbstractStageSolver):
         max_steps: largest number of Newton steps.
     """
 
-    solver: lx.AbstractLinearSolver = ConjugateResidual(rtol=1e-3)
-    rtol: Scalar | None = None
+    solver: Annotated[lx.AbstractLinearSolver, require_solver] = ConjugateResidual(rtol=1e-3)
+    rtol: Annotated[Scalar, tolerance] | None = None
     max_steps: int = eqx.field(static=True, default=30)
 
     def __check_init__(self):
         require_fields(self)
-        require_solver("Newton's solver", self.solver)
-        if self.rtol is not None:
-            require_tolerance("Newton's rtol", self.rtol)
         require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")
 
     def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:

@@ -292,9 +292,7 @@ class AnalyticHessian(AbstractHessian):
     """
 
     projected: bool = eqx.field(static=True, default=False)
-
-    def __check_init__(self):
-        require_fields(self)
+    __check_init__ = require_fields
 
     def at(self, potential: ElasticPotential, u: NodeVector | None) -> TangentAction:
         of_law = lambda law, F: law.projected_differential(F) if self.projected else law.stress_differential(F)  # noqa: E731

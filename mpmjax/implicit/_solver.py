@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
 from mpmjax.autodiff import custom_derivative
-from mpmjax.checks import require, require_fields, require_positive, require_tolerance
+from mpmjax.checks import positive, require, require_fields, tolerance
 from mpmjax.discretisation import Basis, basis_attributes, resist_sum, without_flat
 from mpmjax.implicit._operator import (
     AbstractInnerProduct,
@@ -69,16 +69,12 @@ class ConjugateResidual(AbstractInnerProductSolver):
         max_steps: largest number of steps of the recurrence.
     """
 
-    rtol: Scalar | None = None
-    increment_rtol: Scalar | None = None
+    rtol: Annotated[Scalar, tolerance] | None = None
+    increment_rtol: Annotated[Scalar, positive] | None = None
     max_steps: int = eqx.field(static=True, default=1000)
 
     def __check_init__(self):
         require_fields(self)
-        if self.rtol is not None:
-            require_tolerance("ConjugateResidual's rtol", self.rtol)
-        if self.increment_rtol is not None:
-            require_positive("ConjugateResidual's increment_rtol", self.increment_rtol)
         require(self.max_steps >= 1, f"ConjugateResidual's max_steps must be at least 1, got {self.max_steps}.")
 
     def init(self, operator: Any, options: dict[str, Any]) -> Any:

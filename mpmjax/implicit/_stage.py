@@ -7,7 +7,7 @@ in reverse mode its transpose (eq. 31): one more solve with the same operator. I
 import abc
 import enum
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -138,12 +138,9 @@ class Linearised(AbstractStageSolver):
         solver: linear solver, any symmetric one of lineax. Default: `ConjugateResidual` with default tolerances.
     """
 
-    solver: lx.AbstractLinearSolver = ConjugateResidual()
+    solver: Annotated[lx.AbstractLinearSolver, require_solver] = ConjugateResidual()
     linearises: ClassVar[bool] = True
-
-    def __check_init__(self):
-        require_fields(self)
-        require_solver("Linearised's solver", self.solver)
+    __check_init__ = require_fields
 
     def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         return solve_linearised(self.solver, problem, guess)

@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray
 
-from mpmjax._types import Scalar
-from mpmjax.checks import alternatives, choices, is_abstract, is_class, is_own, may_be_infinite, require, shortened
+from mpmjax._types import MAY_BE_INFINITE, Scalar
+from mpmjax.checks import alternatives, choices, is_abstract, is_class, is_own, marks_of, require, shortened
 from mpmjax.geometry import SampledDistance, sample_mesh
 from mpmjax.state import Scene
 from mpmjax.stepping import AbstractIntegrator
@@ -331,7 +331,7 @@ def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray]
     if float in kinds:
         try:
             a = a if a.dtype.kind == "f" else a.astype(float)
-            bad = np.isnan(a) if may_be_infinite(expected) else ~np.isfinite(a)
+            bad = np.isnan(a) if MAY_BE_INFINITE in marks_of(expected) else ~np.isfinite(a)
         except OverflowError:  # a whole number that no float holds
             bad = np.True_
         _require(not bad.any(), where, f"must be finite, got {_short(data)}")

@@ -1,26 +1,27 @@
 """Elastic laws: fixed corotated and neo-Hookean."""
 
 from collections.abc import Callable
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
-from mpmjax.checks import require_fields, require_moduli
+from mpmjax.checks import between, positive, require_fields
 from mpmjax.material._differential import IsotropicDifferential, PrincipalDifferential
 from mpmjax.material._law import AbstractMaterial
+
+YoungsModulus = Annotated[PerParticle, positive, "Pa"]
+PoissonRatio = Annotated[PerParticle, between(-1, 0.5, open_ends=True)]
 
 
 class AbstractIsotropic(AbstractMaterial):
     """A law given by Young's modulus and Poisson's ratio: at small strains δP = 2μ ε + λ tr(ε) I."""
 
-    youngs_modulus: PerParticle  # E [Pa]
-    poisson_ratio: PerParticle  # ν [-]
-
-    def __check_init__(self):
-        require_fields(self)
-        require_moduli(type(self).__name__, self.youngs_modulus, self.poisson_ratio)
+    youngs_modulus: YoungsModulus  # E [Pa]
+    poisson_ratio: PoissonRatio  # ν [-]
+    __check_init__ = require_fields
 
     @property
     def shear_modulus(self) -> PerParticle:

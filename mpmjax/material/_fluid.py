@@ -1,13 +1,13 @@
 """Laws of the volume alone, a weakly compressible fluid made of one, and viscosity beside any law."""
 
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, PerParticle, Scalar
-from mpmjax.checks import require, require_between, require_fields, require_positive
+from mpmjax.checks import between, positive, require, require_fields
 from mpmjax.material._differential import VolumetricDifferential
 from mpmjax.material._law import (
     VOLUME_RATIO,
@@ -55,13 +55,10 @@ class Tait(AbstractVolumetric):
     *When it breaks*: it needs J > 0; a step that makes a particle's volume negative is reported.
     """
 
-    bulk_modulus: PerParticle
-    exponent: PerParticle = 7.0
+    bulk_modulus: Annotated[PerParticle, positive, "Pa"]
+    exponent: Annotated[PerParticle, positive] = 7.0
     tension: bool = eqx.field(static=True, default=True)
-
-    def __check_init__(self):
-        require_positive("Tait's bulk_modulus [Pa]", self.bulk_modulus)
-        require_positive("Tait's exponent", self.exponent)
+    __check_init__ = require_fields
 
     def energy(self, J: Array, /) -> Array:
         acting = self._acting(J)
@@ -107,14 +104,10 @@ class Fluid(AbstractInelastic):
 
     measure: ClassVar[DeformationMeasure] = VOLUME_RATIO
     relaxes_stress: ClassVar[bool] = False  # it takes out expansion, which has no stress
-    bulk_modulus: PerParticle
-    exponent: PerParticle = 7.0
+    bulk_modulus: Annotated[PerParticle, positive, "Pa"]
+    exponent: Annotated[PerParticle, positive] = 7.0
     tension: bool = eqx.field(static=True, default=False)
-
-    def __check_init__(self):
-        require_fields(self)
-        require_positive("Fluid's bulk_modulus [Pa]", self.bulk_modulus)
-        require_positive("Fluid's exponent", self.exponent)
+    __check_init__ = require_fields
 
     def initial_history(self, J: Array, /) -> None:
         del J
@@ -175,15 +168,13 @@ class Viscous(AbstractLaw):
     """
 
     law: AbstractLaw
-    shear_viscosity: PerParticle
-    bulk_viscosity: PerParticle = 0.0
+    shear_viscosity: Annotated[PerParticle, between(0, jnp.inf), "Pa s"]
+    bulk_viscosity: Annotated[PerParticle, between(0, jnp.inf), "Pa s"] = 0.0
 
     def __check_init__(self):
         require_fields(self)
         require(self.law.viscosity is None, "Viscous takes a law that is not viscous yet: add the viscosities.")
         require(self.law.constraint is None, "Viscous takes a law that deforms: a rigid body has nothing that flows.")
-        require_between("Viscous's shear_viscosity [Pa s]", self.shear_viscosity, 0, float("inf"))
-        require_between("Viscous's bulk_viscosity [Pa s]", self.bulk_viscosity, 0, float("inf"))
 
     @property
     def viscosity(self) -> Viscosity:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -1,7 +1,7 @@
 """Granular materials: sand, soil and snow."""
 
 from functools import reduce
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,9 +9,9 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
-from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
+from mpmjax.checks import between, positive, require_fields
 from mpmjax.linalg import AbstractSpectral
-from mpmjax.material._elastic import FixedCorotated
+from mpmjax.material._elastic import FixedCorotated, PoissonRatio, YoungsModulus
 from mpmjax.material._hencky import AbstractHenckyPlasticity, Hencky
 from mpmjax.material._law import AbstractInelastic
 
@@ -61,13 +61,9 @@ class DruckerPrager(AbstractHenckyPlasticity):
     """
 
     History: ClassVar[Any] = DruckerPragerHistory
-    youngs_modulus: PerParticle
-    poisson_ratio: PerParticle
-    friction_angle: PerParticle
-
-    def __check_init__(self):
-        require_fields(self)
-        require_between("DruckerPrager's friction_angle [rad]", self.friction_angle, 0, np.pi / 2, open_ends=True)
+    youngs_modulus: YoungsModulus
+    poisson_ratio: PoissonRatio
+    friction_angle: Annotated[PerParticle, between(0, np.pi / 2, open_ends=True), "rad"]
 
     def flow(
         self, history: DruckerPragerHistory, mean: Array, deviation: Array, dt: Scalar
@@ -131,19 +127,12 @@ class CamClay(AbstractHenckyPlasticity):
     """
 
     History: ClassVar[Any] = CamClayHistory
-    youngs_modulus: PerParticle
-    poisson_ratio: PerParticle
-    friction: PerParticle
-    preconsolidation: PerParticle
-    cohesion: PerParticle = 0.0
-    hardening: PerParticle = 1.0
-
-    def __check_init__(self):
-        require_fields(self)
-        require_positive("CamClay's friction", self.friction)
-        require_between("CamClay's preconsolidation [Pa]", self.preconsolidation, 0, np.inf)
-        require_between("CamClay's cohesion", self.cohesion, 0, np.inf)
-        require_positive("CamClay's hardening", self.hardening)
+    youngs_modulus: YoungsModulus
+    poisson_ratio: PoissonRatio
+    friction: Annotated[PerParticle, positive]
+    preconsolidation: Annotated[PerParticle, between(0, np.inf), "Pa"]
+    cohesion: Annotated[PerParticle, between(0, np.inf)] = 0.0
+    hardening: Annotated[PerParticle, positive] = 1.0
 
     def initial_variable(self) -> PerParticle:
         """α = −arsinh(p₀/K)/ξ."""
@@ -210,18 +199,12 @@ class Snow(AbstractInelastic):
         hardening: ξ [-], at least 0.
     """
 
-    youngs_modulus: PerParticle = 1.4e5
-    poisson_ratio: PerParticle = 0.2
-    critical_compression: PerParticle = 2.5e-2
-    critical_stretch: PerParticle = 7.5e-3
-    hardening: PerParticle = 10.0
-
-    def __check_init__(self):
-        require_fields(self)
-        require_moduli("Snow", self.youngs_modulus, self.poisson_ratio)
-        require_between("Snow's critical_compression", self.critical_compression, 0, 1, open_ends=True)
-        require_positive("Snow's critical_stretch", self.critical_stretch)
-        require_between("Snow's hardening", self.hardening, 0, 1e3)
+    youngs_modulus: YoungsModulus = 1.4e5
+    poisson_ratio: PoissonRatio = 0.2
+    critical_compression: Annotated[PerParticle, between(0, 1, open_ends=True)] = 2.5e-2
+    critical_stretch: Annotated[PerParticle, positive] = 7.5e-3
+    hardening: Annotated[PerParticle, between(0, 1e3)] = 10.0
+    __check_init__ = require_fields
 
     def initial_history(self, F: Matrix) -> SnowHistory:
         """J_P = 1."""

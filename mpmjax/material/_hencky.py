@@ -2,7 +2,7 @@
 Mises' for metals and Herschel and Bulkley's for pastes, whose flow keeps the volume."""
 
 import abc
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,10 +11,10 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.autodiff import custom_derivative
-from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
+from mpmjax.checks import between, positive, require_fields
 from mpmjax.linalg import Logarithm, PowerLessOne
 from mpmjax.material._differential import PrincipalDifferential
-from mpmjax.material._elastic import AbstractIsotropic
+from mpmjax.material._elastic import AbstractIsotropic, PoissonRatio, YoungsModulus
 from mpmjax.material._law import AbstractInelastic
 
 _log = Logarithm()
@@ -99,8 +99,7 @@ class AbstractHenckyPlasticity(AbstractInelastic):
     youngs_modulus: eqx.AbstractVar[PerParticle]
     poisson_ratio: eqx.AbstractVar[PerParticle]
 
-    def __check_init__(self):
-        require_moduli(type(self).__name__, self.youngs_modulus, self.poisson_ratio)
+    __check_init__ = require_fields
 
     def initial_variable(self) -> PerParticle:
         """The history's variable where nothing has yielded. Default: zero."""
@@ -192,15 +191,10 @@ class VonMises(AbstractHenckyPlasticity):
     """
 
     History: ClassVar[Any] = VonMisesHistory
-    youngs_modulus: PerParticle
-    poisson_ratio: PerParticle
-    yield_stress: PerParticle
-    hardening_modulus: PerParticle = 0.0
-
-    def __check_init__(self):
-        require_fields(self)
-        require_positive("VonMises's yield_stress [Pa]", self.yield_stress)
-        require_between("VonMises's hardening_modulus [Pa]", self.hardening_modulus, 0, np.inf)
+    youngs_modulus: YoungsModulus
+    poisson_ratio: PoissonRatio
+    yield_stress: Annotated[PerParticle, positive, "Pa"]
+    hardening_modulus: Annotated[PerParticle, between(0, np.inf), "Pa"] = 0.0
 
     def flow(self, history: VonMisesHistory, mean: Array, deviation: Array, dt: Scalar) -> tuple[Array, Array, Array]:
         """Radial return of the deviator."""
@@ -251,17 +245,11 @@ class HerschelBulkley(AbstractHenckyPlasticity):
     """
 
     History: ClassVar[Any] = VonMisesHistory
-    youngs_modulus: PerParticle
-    poisson_ratio: PerParticle
-    yield_stress: PerParticle
-    consistency: PerParticle
-    exponent: PerParticle = 1.0
-
-    def __check_init__(self):
-        require_fields(self)
-        require_positive("HerschelBulkley's yield_stress [Pa]", self.yield_stress)
-        require_between("HerschelBulkley's consistency [Pa s^n]", self.consistency, 0, np.inf)
-        require_positive("HerschelBulkley's exponent", self.exponent)
+    youngs_modulus: YoungsModulus
+    poisson_ratio: PoissonRatio
+    yield_stress: Annotated[PerParticle, positive, "Pa"]
+    consistency: Annotated[PerParticle, between(0, np.inf), "Pa s^n"]
+    exponent: Annotated[PerParticle, positive] = 1.0
 
     @property
     def flows(self) -> bool:

@@ -2,6 +2,7 @@
 
 import abc
 from functools import reduce
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
-from mpmjax.checks import as_plain, require, require_fields, require_finite, require_positive, require_that
+from mpmjax.checks import as_plain, finite, positive, require, require_fields, require_that
 from mpmjax.linalg import PowerBeyondLine, PowerLessOne, exponential_beyond_line
 from mpmjax.material._differential import PrincipalDifferential
 from mpmjax.material._law import AbstractMaterial
@@ -28,6 +29,7 @@ class AbstractRubber(AbstractMaterial):
     """
 
     bulk_modulus: eqx.AbstractVar[PerParticle]  # K [Pa]
+    __check_init__ = require_fields
 
     @abc.abstractmethod
     def powers(self) -> tuple[PerParticle, ...]:
@@ -132,16 +134,13 @@ class MooneyRivlin(AbstractRubber):
         bulk_modulus: K [Pa].
     """
 
-    c1: PerParticle
-    c2: PerParticle
-    bulk_modulus: PerParticle
+    c1: Annotated[PerParticle, finite, "Pa"]
+    c2: Annotated[PerParticle, finite, "Pa"]
+    bulk_modulus: Annotated[PerParticle, positive, "Pa"]
 
     def __check_init__(self):
         require_fields(self)
-        require_finite("MooneyRivlin's c1 [Pa]", self.c1)
-        require_finite("MooneyRivlin's c2 [Pa]", self.c2)
         require_that("MooneyRivlin's c1 and c2 [Pa] must have a positive sum", lambda a, b: a + b > 0, self.c1, self.c2)
-        require_positive("MooneyRivlin's bulk_modulus [Pa]", self.bulk_modulus)
 
     @property
     def shear_modulus(self) -> PerParticle:
@@ -172,17 +171,10 @@ class Yeoh(AbstractRubber):
         bulk_modulus: K [Pa].
     """
 
-    c1: PerParticle
-    c2: PerParticle
-    c3: PerParticle
-    bulk_modulus: PerParticle
-
-    def __check_init__(self):
-        require_fields(self)
-        require_positive("Yeoh's c1 [Pa]", self.c1)
-        require_finite("Yeoh's c2 [Pa]", self.c2)
-        require_finite("Yeoh's c3 [Pa]", self.c3)
-        require_positive("Yeoh's bulk_modulus [Pa]", self.bulk_modulus)
+    c1: Annotated[PerParticle, positive, "Pa"]
+    c2: Annotated[PerParticle, finite, "Pa"]
+    c3: Annotated[PerParticle, finite, "Pa"]
+    bulk_modulus: Annotated[PerParticle, positive, "Pa"]
 
     @property
     def shear_modulus(self) -> PerParticle:
@@ -213,15 +205,9 @@ class Gent(AbstractRubber):
         bulk_modulus: K [Pa].
     """
 
-    shear_modulus: PerParticle
-    limit: PerParticle
-    bulk_modulus: PerParticle
-
-    def __check_init__(self):
-        require_fields(self)
-        require_positive("Gent's shear_modulus [Pa]", self.shear_modulus)
-        require_positive("Gent's limit", self.limit)
-        require_positive("Gent's bulk_modulus [Pa]", self.bulk_modulus)
+    shear_modulus: Annotated[PerParticle, positive, "Pa"]
+    limit: Annotated[PerParticle, positive]
+    bulk_modulus: Annotated[PerParticle, positive, "Pa"]
 
     def powers(self) -> tuple[PerParticle, ...]:
         return (2,)
@@ -258,9 +244,9 @@ class Ogden(AbstractRubber):
         bulk_modulus: K [Pa].
     """
 
-    moduli: tuple[Scalar, ...] = eqx.field(converter=as_plain)
-    exponents: tuple[Scalar, ...] = eqx.field(converter=as_plain)
-    bulk_modulus: PerParticle
+    moduli: Annotated[tuple[Scalar, ...], finite, "Pa"] = eqx.field(converter=as_plain)
+    exponents: Annotated[tuple[Scalar, ...], finite] = eqx.field(converter=as_plain)
+    bulk_modulus: Annotated[PerParticle, positive, "Pa"]
 
     def __check_init__(self):
         require_fields(self)
@@ -269,12 +255,9 @@ class Ogden(AbstractRubber):
             terms == len(self.exponents) > 0,
             f"Ogden needs a modulus and an exponent for each of its terms, got {terms} and {len(self.exponents)}.",
         )
-        require_finite("Ogden's moduli [Pa]", self.moduli)
-        require_finite("Ogden's exponents", self.exponents)
         require_that("Ogden's exponents must not be zero", lambda a: a != 0, self.exponents)
         sum_of_moduli = "Ogden's moduli [Pa] times their exponents must have a positive sum"
         require_that(sum_of_moduli, lambda m, a: (m * a).sum() > 0, self.moduli, self.exponents)
-        require_positive("Ogden's bulk_modulus [Pa]", self.bulk_modulus)
 
     @property
     def shear_modulus(self) -> Scalar:

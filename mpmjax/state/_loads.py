@@ -2,7 +2,7 @@
 
 import abc
 from dataclasses import replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -81,11 +81,8 @@ class Traction(AbstractLoad):
     """
 
     on: AbstractPlace
-    traction: ChangingVector
-
-    def __check_init__(self):
-        require_fields(self)
-        require_some("Traction's traction [N/m²]", self.traction)
+    traction: Annotated[ChangingVector, require_some, "N/m²"]
+    __check_init__ = require_fields
 
     def check(self, dim: int) -> None:
         _check_dead_load("Traction's traction", self, self.traction, dim)
@@ -107,11 +104,8 @@ class PointLoad(AbstractLoad):
     """
 
     on: AbstractPlace
-    total: ChangingVector
-
-    def __check_init__(self):
-        require_fields(self)
-        require_some("PointLoad's total [N]", self.total)
+    total: Annotated[ChangingVector, require_some, "N"]
+    __check_init__ = require_fields
 
     def check(self, dim: int) -> None:
         _check_dead_load("PointLoad's total", self, self.total, dim)
@@ -137,12 +131,11 @@ class Pressure(AbstractLoad):
     """
 
     on: AbstractPlace
-    pressure: Changing
+    pressure: Annotated[Changing, require_some, "Pa"]
     following: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
         require_fields(self)
-        require_some("Pressure's pressure [Pa]", self.pressure)
         if isinstance(self.pressure, TimeSeries):
             require(vector_size(self.pressure) is None, "Pressure's pressure must be a series of numbers, got vectors.")
 
@@ -358,13 +351,12 @@ class Couple(AbstractLoad):
     """
 
     on: AbstractPlace
-    total: Scalar | Point | TimeSeries
+    total: Annotated[Scalar | Point | TimeSeries, require_some, "N m"]
     moves_points_on: ClassVar[bool] = False  # forces act on the nodes as the step begins
     may_be_revolved: ClassVar[bool] = False
 
     def __check_init__(self):
         require_fields(self)
-        require_some("Couple's total [N m]", self.total)
         if isinstance(self.on, AttachedPoints):
             count = shape_of(self.on.particle)[0]
             require(count >= self.on.dim, f"A Couple needs {self.on.dim} points at least, got {count}.")

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import lineax as lx
 
 from mpmjax._types import NodeVector, Scalar
 from mpmjax.autodiff import without_derivative
-from mpmjax.checks import require_between, require_fields
+from mpmjax.checks import between, require_fields
 from mpmjax.implicit import (
     AbstractHessian,
     AbstractPreconditioner,
@@ -53,12 +53,12 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
 
     hessian: AbstractHessian = eqx.field(default=AnalyticHessian(), kw_only=True)
     preconditioner: AbstractPreconditioner = eqx.field(default=DiagonalPreconditioner(), kw_only=True)
-    adjoint_solver: lx.AbstractLinearSolver = eqx.field(default=ConjugateResidual(), kw_only=True)
+    adjoint_solver: Annotated[lx.AbstractLinearSolver, require_solver] = eqx.field(
+        default=ConjugateResidual(), kw_only=True
+    )
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY, kw_only=True)
 
-    def __check_init__(self):
-        require_fields(self)
-        require_solver(f"{type(self).__name__}'s adjoint_solver", self.adjoint_solver)
+    __check_init__ = require_fields
 
     def solved_by(self) -> Callable[[StageProblem, NodeVector], tuple[NodeVector, SolveInfo]]:
         """How the equation of a stage is solved, as an `AbstractStageSolver` does. Default: by the field `solution`."""
@@ -183,13 +183,8 @@ class SemiImplicit(AbstractImplicitIntegrator):
     """
 
     linearises: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
-    beta: Scalar = 1.0
-    solver: lx.AbstractLinearSolver = ConjugateResidual()
-
-    def __check_init__(self):
-        require_fields(self)
-        require_solver("SemiImplicit's solver", self.solver)
-        require_between("SemiImplicit's beta", self.beta, 0, 1)
+    beta: Annotated[Scalar, between(0, 1)] = 1.0
+    solver: Annotated[lx.AbstractLinearSolver, require_solver] = ConjugateResidual()
 
     def solved_by(self) -> Callable[[StageProblem, NodeVector], tuple[NodeVector, SolveInfo]]:
         return eqx.Partial(solve_linearised, self.solver)
@@ -307,13 +302,9 @@ class TRBDF2(AbstractImplicitIntegrator):
         hessian, preconditioner, adjoint_solver, guess: see `AbstractImplicitIntegrator`.
     """
 
-    rho: Scalar = 0.0
+    rho: Annotated[Scalar, between(0, 1)] = 0.0
     solution: AbstractStageSolver = Linearised()
     body_force_at: ClassVar[float] = 0.5
-
-    def __check_init__(self):
-        require_fields(self)
-        require_between("TRBDF2's rho", self.rho, 0, 1)
 
     def weights(self) -> tuple[Scalar, Scalar, Scalar, Scalar]:
         """γ, q_0, q_1, q_2: γ solves (1 − ρ∞)γ² − 4γ + 2 = 0, q_2 = ½γ, q_1 = (½ − q_2)/γ, q_0 = 1 − q_1 − q_2."""
