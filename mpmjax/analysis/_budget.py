@@ -16,17 +16,12 @@ from mpmjax.stepping import AbstractIntegrator, Explicit, grid_to_particles, rea
 
 
 class Energy(eqx.Module):
-    """The energy of a state [J] (per metre of thickness in 2-D, per square metre of section in 1-D).
-
-    Attributes:
-        kinetic: ½ Σ m (‖v‖² + tr(C D Cᵀ)), with the affine part for APIC; of a rigid body ½ M ‖V‖² + ½ ω·Iω.
-        elastic: Σ V0 Ψ(F), with the elastic law for the present history.
-        potential: −Σ m g·x.
-    """
+    """The energy of a state [J] (per metre of thickness in 2-D, per square metre of section in 1-D)."""
 
     kinetic: Float[Array, "*f"]
-    elastic: Float[Array, "*f"]
-    potential: Float[Array, "*f"]
+    """½ Σ m (‖v‖² + tr(C D Cᵀ)), with the affine part for APIC; of a rigid body ½ M ‖V‖² + ½ ω·Iω."""
+    elastic: Float[Array, "*f"]  # Σ V0 Ψ(F), with the elastic law for the present history
+    potential: Float[Array, "*f"]  # −Σ m g·x
 
     @property
     def total(self) -> Float[Array, "*f"]:
@@ -119,15 +114,12 @@ class EnergyBudget(eqx.Module):
     none is the remainder of the others. So if the budget closes to rounding, all of them are right.
     """
 
-    kinetic: Float[Array, "*f"]
-    """Change of the particles' kinetic energy, with that of their affine motion."""
+    kinetic: Float[Array, "*f"]  # change of the particles' kinetic energy, with that of their affine motion
     elastic: Float[Array, "*f"]
     """Change of Σ V0 Ψ(F), and of the energy of the loads' terms, such as springs to the ground, by the motion of the
     body; that by a ground that moves is left out."""
-    potential: Float[Array, "*f"]
-    """Change of −Σ m g·x, minus the work of gravity."""
-    p2g: Float[Array, "*f"]
-    """Loss from particles to grid, ½ Σ_ip w m ‖u_ip − v_i^n‖² ≥ 0."""
+    potential: Float[Array, "*f"]  # change of −Σ m g·x, minus the work of gravity
+    p2g: Float[Array, "*f"]  # loss from particles to grid, ½ Σ_ip w m ‖u_ip − v_i^n‖² ≥ 0
     g2p: Float[Array, "*f"]
     """Loss from grid to particles, ½ Σ_ip w m ‖v_i^{n+1} − u_ip^{n+1}‖² ≥ 0 with PIC and APIC. With other transfers u
     is the velocity from the grid, and the energy of the velocity that particles keep is subtracted. The energy of the
@@ -137,10 +129,8 @@ class EnergyBudget(eqx.Module):
     semi-implicit step. In methods of second order `time_integration` cancels it up to third order in Δt."""
     boundary: Float[Array, "*f"]
     """Work of walls and grips, impulse·v̄. At a wall it is the kinetic energy of what stops there."""
-    friction: Float[Array, "*f"]
-    """Work of friction, ≤ 0."""
-    body_force: Float[Array, "*f"]
-    """Work of the scene's body force and loads."""
+    friction: Float[Array, "*f"]  # work of friction, ≤ 0
+    body_force: Float[Array, "*f"]  # work of the scene's body force and loads
     viscous: Float[Array, "*f"]
     """Dissipation by viscosity and dashpots, Δt Σ V σ_v : D ≥ 0, at the velocity in the viscous force."""
     plastic: Float[Array, "*f"]
@@ -150,8 +140,7 @@ class EnergyBudget(eqx.Module):
     averaging: Float[Array, "*f"]
     """Change of Σ V0 Ψ(F̄) where volumes are averaged, by the particles' new places on the grid at the same F. Zero in
     the total description, and without averages."""
-    solver: Float[Array, "*f"]
-    """Work of the residual of the solve."""
+    solver: Float[Array, "*f"]  # work of the residual of the solve
     time_integration: Float[Array, "*f"]
     """Error of the time step: the change of the energies minus the work of their forces at the start,
     [Φ(Δt v_c) − Φ(0) + Δt f^n·v̄] + Δt G·(v̄ − v_c), with v_c the velocity at which the nodes move and G their weight,
@@ -179,22 +168,14 @@ class MomentumBudget(eqx.Module):
     vanish.
     """
 
-    change: Float[Array, "*f d"]
-    """Change of Σ m v."""
-    gravity: Float[Array, "*f d"]
-    """Impulse of gravity."""
-    body_force: Float[Array, "*f d"]
-    """Impulse of the scene's body force and loads."""
-    boundary: Float[Array, "*f d"]
-    """Impulse of walls and grips, and the residual of the solve."""
-    friction: Float[Array, "*f d"]
-    """Impulse of friction."""
-    elastic: Float[Array, "*f d"]
-    """Impulse of the elastic force, and of the loads' terms."""
-    viscous: Float[Array, "*f d"]
-    """Impulse of viscosity and dashpots."""
-    transfer: Float[Array, "*f d"]
-    """Change by the transfers."""
+    change: Float[Array, "*f d"]  # change of Σ m v
+    gravity: Float[Array, "*f d"]  # impulse of gravity
+    body_force: Float[Array, "*f d"]  # impulse of the scene's body force and loads
+    boundary: Float[Array, "*f d"]  # impulse of walls and grips, and the residual of the solve
+    friction: Float[Array, "*f d"]  # impulse of friction
+    elastic: Float[Array, "*f d"]  # impulse of the elastic force, and of the loads' terms
+    viscous: Float[Array, "*f d"]  # impulse of viscosity and dashpots
+    transfer: Float[Array, "*f d"]  # change by the transfers
 
     @property
     def explained(self) -> Float[Array, "*f d"]:

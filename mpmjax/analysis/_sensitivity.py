@@ -20,10 +20,8 @@ _POINTS = 100
 class Sensitivity(eqx.Module):
     """The growth of a rollout's derivative with respect to the initial velocities, over its horizon."""
 
-    times: Float[Array, "f"]
-    """Time since the start [s], shape (f,)."""
-    steps: Float[Array, "f"]
-    """Steps since the start, shape (f,)."""
+    times: Float[Array, "f"]  # time since the start [s], shape (f,)
+    steps: Float[Array, "f"]  # steps since the start, shape (f,)
     growth: Float[Array, "f"]
     """‖δx‖ / (t ‖δv0‖) [-], shape (f,): the dependence of positions on initial velocities, relative to free flight. NaN
     after a fault of the run, and everywhere if a solve of the run or of its derivative did not converge."""

@@ -16,13 +16,9 @@ _TURNED = (1 + 2**0.5) / 2
 
 
 class Activation(eqx.Module):
-    """The history of an `Active` law.
+    """The history of an `Active` law."""
 
-    Attributes:
-        activation: a [-], shape (q,): from 0, at rest, to 1.
-    """
-
-    activation: Float[Array, "*q"]
+    activation: Float[Array, "*q"]  # a [-], shape (q,): from 0, at rest, to 1
 
 
 class Active(AbstractInelastic):

@@ -27,7 +27,6 @@ class Kept(eqx.Module):
     marks: tuple[bool, ...] = eqx.field(static=True)
 
     def __call__(self, scene: Scene, particles: Particles) -> list[Array]:
-        del scene
         return [leaf for leaf, mark in zip(jax.tree.leaves(state_of(particles)), self.marks, strict=True) if mark]
 
     def put(self, particles: Particles, parts: list[Array]) -> Particles:
@@ -128,7 +127,6 @@ class Evaluated(eqx.Module):
 
     def jacobian(self, z: Coordinates, sigmas: Sigmas, mode: Any = None) -> tuple[Array, Array]:
         """Residuals and Jacobian, see `FitProblem.jacobian`."""
-        del z, sigmas, mode
         return self.r, jnp.asarray(self.J)
 
     def room(self, z: Coordinates) -> Float[Array, "2 n"]:

@@ -58,13 +58,11 @@ class Curve(_Measured):
         return self.of(scene, particles)
 
     def predict(self, seen: Any, run: Run) -> Array:
-        del run
         x, y = seen
         reached = ~self._beyond(x, jnp.asarray(self.x, y.dtype)) & (jnp.diff(x) > 0).all()
         return jnp.where(reached, jnp.interp(jnp.asarray(self.x, y.dtype), x, y), jnp.nan)
 
     def explain(self, seen: Any, run: Run) -> None:
-        del run
         x, y = (np.asarray(a) for a in seen)
         require(
             np.isfinite(x).all() and (np.diff(x) > 0).all(),
@@ -254,7 +252,6 @@ class Force(Series):
         )
 
     def predict(self, seen: Any, run: Run) -> Array:
-        del seen
         at = run.method.force_at()
         return self._at_times(self._simulated(run), run, 0.0 if at is None else at)
 
@@ -275,7 +272,6 @@ class Torque(Force):
 
 def _nothing(scene: Scene, particles: Particles) -> Array:
     """A zero: nothing is needed of the states."""
-    del scene
     return jnp.zeros((), particles.x.dtype)
 
 

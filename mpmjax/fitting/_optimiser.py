@@ -106,7 +106,6 @@ class LevenbergMarquardt(AbstractOptimiser):
         return bool(far and np.abs(taken).max() < _REFUSED * np.abs(wanted).max())
 
     def distance(self, state: Any, seen: Evaluation) -> float:
-        del state
         r, J, step, limited = _gauss_newton(seen)
         rows, columns = J.shape
         if rows <= columns or not np.isfinite(step).all():
@@ -183,7 +182,6 @@ class LBFGS(AbstractOptimiser):
     line_search: Annotated[int, whole(1)] = eqx.field(static=True, default=20)
 
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "LBFGSState":
-        del problem, sigmas
         no, zero, none = jnp.asarray(False), jnp.zeros((), z.dtype), jnp.zeros((), jnp.int32)
         past: Any = optax.scale_by_lbfgs(self.memory).init(z)
         return LBFGSState(no, zero, jnp.zeros_like(z), past, zero + jnp.inf, zero, none, no)
@@ -200,7 +198,6 @@ class LBFGS(AbstractOptimiser):
         return z, state, Evaluation(state.cost, state.gradient)
 
     def has_converged(self, state: "LBFGSState", seen: Evaluation) -> bool:
-        del seen
         return bool((state.small > 1) | (state.stalled & (state.predicted_decrease <= state.decrease_tolerance)))
 
     def has_stalled(self, state: "LBFGSState") -> bool:
@@ -306,7 +303,6 @@ class Adam(AbstractOptimiser):
         return self.learning_rate(number) if callable(self.learning_rate) else self.learning_rate
 
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "AdamState":
-        del problem, sigmas
         one, zero, rate = jnp.ones((), z.dtype), jnp.zeros((), jnp.int32), jnp.asarray(self.rate(0), z.dtype)
         return AdamState(zero, z, _MOMENTS.init(z), one * jnp.inf, jnp.zeros_like(z), one, rate, zero)
 
@@ -340,7 +336,6 @@ class Adam(AbstractOptimiser):
         return z, after, Evaluation(best, slope)
 
     def has_converged(self, state: "AdamState", seen: Evaluation) -> bool:
-        del seen
         return bool(state.step < self.atol)
 
 

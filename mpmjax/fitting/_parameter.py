@@ -55,7 +55,6 @@ class AbstractPrior(eqx.Module):
 
     def drawn(self, rng: np.random.Generator) -> "AbstractPrior":
         """The prior as another measurement would have given it. Default: itself."""
-        del rng
         return self
 
 
@@ -71,7 +70,6 @@ class Gaussian(AbstractPrior):
 
     def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
         """(value − mean)/σ."""
-        del free
         return ((value - jnp.asarray(self.mean, value.dtype)) / jnp.asarray(self.sigma, value.dtype)).reshape(-1)
 
     def distribution(self) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +105,6 @@ class Smooth(AbstractPrior):
 
     def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
         """(f_{i+1} − f_i)/σ along each axis."""
-        del value
         parts = [jnp.diff(free, axis=axis).reshape(-1) for axis in range(free.ndim)]
         r = jnp.concatenate(parts) / jnp.asarray(self.sigma, free.dtype)
         return r if self.robust is None else drawn_nearer(r, jnp.asarray(self.robust, free.dtype))
@@ -189,7 +186,6 @@ class AbstractParameter(eqx.Module):
     def room(self, start: Value, z: Value) -> tuple[Value, Value]:
         """How far the value can fall and rise until its bounds, each over its derivative by z [-], of the value's
         shape: after so many units of z a straight line in the value meets the bound."""
-        del start
         return jnp.full_like(z, jnp.inf), jnp.full_like(z, jnp.inf)
 
     def prior_residuals(self, value: Value) -> Array:
@@ -278,7 +274,6 @@ class Positive(_PlainParameter):
         return jnp.log(value)
 
     def room(self, start: Value, z: Value) -> tuple[Value, Value]:
-        del start
         return jnp.ones_like(z), jnp.full_like(z, jnp.inf)
 
 

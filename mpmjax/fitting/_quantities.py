@@ -83,7 +83,6 @@ class Markers(eqx.Module):
 
     def __call__(self, scene: Scene, particles: Particles) -> Float[Array, "m d"]:
         """Positions [m], shape (m, d)."""
-        del scene
         if not is_traced(self.which):
             self.check("markers", particles.count)
         return (jnp.asarray(self.share, particles.x.dtype)[..., None] * particles.x[self.which]).sum(axis=1)
@@ -100,7 +99,6 @@ class Extent(eqx.Module):
 
     def __call__(self, scene: Scene, particles: Particles) -> Float[Array, ""]:
         """The coordinate [m]."""
-        del scene
         require(0 <= self.axis < particles.dim, f"Extent's axis must be below {particles.dim}, got {self.axis}.")
         along, there = particles.x[:, self.axis], particles.mass > 0
         if self.side == "upper":
@@ -113,7 +111,6 @@ class CentreOfMass(eqx.Module):
 
     def __call__(self, scene: Scene, particles: Particles) -> Float[Array, "d"]:
         """Σ m x / Σ m."""
-        del scene
         return particles.mass @ particles.x / particles.mass.sum()
 
 
@@ -162,7 +159,6 @@ class Density(eqx.Module):
 
     def __call__(self, scene: Scene, particles: Particles) -> Array:
         """The density [kg/m^d], of the grid's shape."""
-        del scene
         return self._picture(particles.x, particles.mass)
 
     @checked

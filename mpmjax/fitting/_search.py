@@ -62,18 +62,15 @@ class AbstractOptimiser(eqx.Module):
 
     def directed(self, z: Coordinates, state: Any, seen: Evaluation) -> Any:
         """The state for the next iteration, outside of what is compiled. Default: as it is."""
-        del z, seen
         return state
 
     def distance(self, state: Any, seen: Evaluation) -> float:
         """How far the search is from converged, as a multiple of where it ends, by which the time left is estimated;
         NaN if that is not known, which is the default."""
-        del state, seen
         return float("nan")
 
     def has_stalled(self, state: Any) -> bool:
         """Whether the search goes no further, and is not known to be at a minimum."""
-        del state
         return False
 
 

@@ -214,7 +214,6 @@ class StepSolver(diffrax.AbstractSolver):
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: RolloutState, args: Problem) -> tuple[RunStatistics, Array]:
         """Empty statistics, and a report of zero."""
-        del terms, t0, t1
         dtype = y0.particles.x.dtype
         statistics = no_steps(dtype)
         if args.fault is not None:
@@ -225,7 +224,6 @@ class StepSolver(diffrax.AbstractSolver):
         self, terms: Any, t0: Any, t1: Any, y0: RolloutState, args: Problem, solver_state: Any, made_jump: Any
     ) -> tuple:
         """One step. A fault is reported as the solver's failure: as an event diffrax would ask for it once more."""
-        del terms, t1, made_jump
         statistics, report = solver_state
         step = jnp.round(t0)  # diffrax divides an interval evenly, which is exact only up to rounding
         args, y = args.resorted(y0, step)
@@ -274,7 +272,6 @@ class SegmentAdjoint(diffrax.AbstractAdjoint):
 
     def _nested_loops(self, cond_fun: Any, body_fun: Any, state: Any, *, max_steps: int, buffers: Any) -> Any:
         """As `equinox.internal.while_loop`."""
-        del cond_fun, buffers
         turns = math.prod(self.lengths)
 
         def taken(state: Any) -> Any:

@@ -34,48 +34,30 @@ class Fault(enum.IntEnum):
 
 
 class RunStatistics(eqx.Module):
-    """Sums over the steps of a run.
+    """Sums over the steps of a run."""
 
-    Attributes:
-        steps: steps taken.
-        iterations: iterations of the linear solver.
-        most_iterations: largest number of iterations in one step.
-        newton: newton steps.
-        line_search: halvings by the line search.
-        worst_residual: largest relative residual at the end of a solve.
-        force_error: largest error of a step's elastic force [N] (see `StepInfo.force_error`).
-        force_scale: largest scale of these forces [N].
-        unconverged: steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a
-            solution.
-        nearly_converged: steps whose solve missed its tolerance, by less than ten times: the run is less accurate than
-            was asked for.
-        indefinite: steps whose solve met negative curvature: compression has made M + χH indefinite, and near a
-            singular one the motion is wrong however small the residual. `AnalyticHessian(projected=True)` or a smaller
-            step avoids it.
-        sweeps: solves for contact beyond one a step.
-        violations: contact conditions left violated, summed over steps.
-        fault: the first `Fault`.
-        fault_step: number of steps that led to it.
-        unmet: with BAD_PARAMETERS the number, from one, of the first of the `requirements` on scene, particles and
-            method that is not met; else zero.
-    """
-
-    steps: Int[Array, "*f"]
-    iterations: Int[Array, "*f"]
-    most_iterations: Int[Array, "*f"]
-    newton: Int[Array, "*f"]
-    line_search: Int[Array, "*f"]
-    worst_residual: Float[Array, "*f"]
-    force_error: Float[Array, "*f"]
-    force_scale: Float[Array, "*f"]
+    steps: Int[Array, "*f"]  # steps taken
+    iterations: Int[Array, "*f"]  # iterations of the linear solver
+    most_iterations: Int[Array, "*f"]  # largest number of iterations in one step
+    newton: Int[Array, "*f"]  # Newton steps
+    line_search: Int[Array, "*f"]  # halvings by the line search
+    worst_residual: Float[Array, "*f"]  # largest relative residual at the end of a solve
+    force_error: Float[Array, "*f"]  # largest error of a step's elastic force [N] (see `StepInfo.force_error`)
+    force_scale: Float[Array, "*f"]  # largest scale of these forces [N]
     unconverged: Int[Array, "*f"]
+    """Steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a solution."""
     nearly_converged: Int[Array, "*f"]
+    """Steps whose solve missed its tolerance, by less than ten times: the run is less accurate than was asked for."""
     indefinite: Int[Array, "*f"]
-    sweeps: Int[Array, "*f"]
-    violations: Int[Array, "*f"]
-    fault: Int[Array, "*f"]
-    fault_step: Int[Array, "*f"]
+    """Steps whose solve met negative curvature: compression has made M + χH indefinite, and near a singular one the
+    motion is wrong however small the residual. `AnalyticHessian(projected=True)` or a smaller step avoids it."""
+    sweeps: Int[Array, "*f"]  # solves for contact beyond one a step
+    violations: Int[Array, "*f"]  # contact conditions left violated, summed over steps
+    fault: Int[Array, "*f"]  # the first `Fault`
+    fault_step: Int[Array, "*f"]  # number of steps that led to it
     unmet: Int[Array, "*f"]
+    """With BAD_PARAMETERS the number, from one, of the first of the `requirements` on scene, particles and method that
+    is not met; else zero."""
 
     @property
     def linearisation_error(self) -> Float[Array, "*f"]:
@@ -159,50 +141,35 @@ class Forces(NamedTuple):
 
 
 class Run(eqx.Module):
-    """A simulation's outcome. A pytree: it can be returned from `jax.jit`, `jax.vmap` and differentiated.
+    """A simulation's outcome. A pytree: it can be returned from `jax.jit`, `jax.vmap` and differentiated."""
 
-    Attributes:
-        scene: the scene, with numbers as arrays of the particles' precision.
-        method: the integrator, likewise.
-        dt: Δt [s].
-        steps: step number of each saved frame, shape (f,).
-        frames: the saved states, with a leading axis f; None where nothing or only observations were saved.
-        observed: the result of `observe` for each frame, with a leading axis f.
-        final: the particles at the end.
-        final_step: step number at the end.
-        statistics: solver and contact statistics, and the first fault.
-        report: zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not
-            converge, zero if all did. None of a run from a file.
-        collider_impulse: linear and angular impulse on the scene's colliders from the run's start to each saved frame,
-            with a leading axis f; None without colliders, or where nothing was saved. The difference between two
-            frames, over the time between them, is the mean force and torque of these steps (see `forces`, which says at
-            what time).
-        final_collider_impulse: linear and angular impulse on the colliders to the end; None without colliders.
-        boundary_impulse: as `collider_impulse`, on each of the scene's boundaries (see `boundary_forces`); None unless
-            the scene has `boundary_forces`, or where nothing was saved.
-        final_boundary_impulse: impulse on each of the scene's boundaries from the run's start to its end; None unless
-            the scene has `boundary_forces`.
-        memory: the memory of the run's control at each saved frame, with a leading axis f; of a run from a file its
-            arrays.
-        final_memory: the memory of the control at the end, with which another run goes on.
-    """
-
-    scene: Scene
-    method: AbstractIntegrator
-    dt: Scalar
-    steps: Float[Array, "*f"]
-    frames: State | None
-    observed: Any
-    final: Particles
-    final_step: Float[Array, ""]
-    statistics: RunStatistics
+    scene: Scene  # the scene, with numbers as arrays of the particles' precision
+    method: AbstractIntegrator  # the integrator, likewise
+    dt: Scalar  # Δt [s]
+    steps: Float[Array, "*f"]  # step number of each saved frame, shape (f,)
+    frames: State | None  # the saved states, with a leading axis f; None where nothing or only observations were saved
+    observed: Any  # the result of `observe` for each frame, with a leading axis f
+    final: Particles  # the particles at the end
+    final_step: Float[Array, ""]  # step number at the end
+    statistics: RunStatistics  # solver and contact statistics, and the first fault
     report: Float[Array, "..."] | None = None
+    """Zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not converge,
+    zero if all did. None of a run from a file."""
     collider_impulse: Impulses | None = None
+    """Linear and angular impulse on the scene's colliders from the run's start to each saved frame, with a leading
+    axis f; None without colliders, or where nothing was saved. The difference between two frames, over the time
+    between them, is the mean force and torque of these steps (see `forces`, which says at what time)."""
     final_collider_impulse: Impulses | None = None
+    """Linear and angular impulse on the colliders to the end; None without colliders."""
     boundary_impulse: Impulses | None = None
+    """As `collider_impulse`, on each of the scene's boundaries (see `boundary_forces`); None unless the scene has
+    `boundary_forces`, or where nothing was saved."""
     final_boundary_impulse: Impulses | None = None
+    """Impulse on each of the scene's boundaries from the run's start to its end; None unless the scene has
+    `boundary_forces`."""
     memory: Any = None
-    final_memory: Any = None
+    """The memory of the run's control at each saved frame, with a leading axis f; of a run from a file its arrays."""
+    final_memory: Any = None  # the memory of the control at the end, with which another run goes on
 
     @property
     def times(self) -> Float[Array, "*f"]:

@@ -285,7 +285,6 @@ def integrate(
     state = state.to_loop_layout()
 
     def frame(t: Any, y: RolloutState, args: Problem) -> Any:
-        del t
         y = y.as_given()
         value = y.particles if args.observe is None else args.observe(args.scene, args.at(y.particles))
         return value, y.collider_impulse, y.boundary_impulse, y.memory

@@ -26,31 +26,24 @@ class Particles(eqx.Module):
     with none are not there (see `mpmjax.extensions.Inlet`). Every leaf is a float array of one dtype. Particles of
     several materials lie group after group (see `join`). Deformations and histories have one entry a material, None
     until they are known; `F` and `history` are those of the only material.
-
-    Attributes:
-        x: positions [m], shape (p, d).
-        v: velocities [m/s], shape (p, d).
-        mass: masses [kg], shape (p,).
-        volume: undeformed volumes V0 [m^d], shape (p,).
-        deformations: for each material the deformation gradients F [-], for laws that yield their elastic part, shape
-            (q, d, d); for laws that depend on J = det F only, J, shape (q,).
-        C: velocity gradients ∇_x v [1/s], in the total description ∇_X v, shape (p, d, d): the affine velocities of
-            APIC, and what viscosity resists.
-        X: reference positions [m], shape (p, d), in the total description.
-        histories: for each material the history of a law that yields, a pytree of arrays of shape (q,) each (see the
-            law); else None.
-        counts: number of particles of each of several materials; None if there is one.
     """
 
-    x: ParticleVector
-    v: ParticleVector
-    mass: ParticleScalar
-    volume: ParticleScalar
+    x: ParticleVector  # positions [m], shape (p, d)
+    v: ParticleVector  # velocities [m/s], shape (p, d)
+    mass: ParticleScalar  # masses [kg], shape (p,)
+    volume: ParticleScalar  # undeformed volumes V0 [m^d], shape (p,)
     deformations: Deformations = ()
+    """For each material the deformation gradients F [-], for laws that yield their elastic part, shape (q, d, d); for
+    laws that depend on J = det F only, J, shape (q,)."""
     C: ParticleMatrix | None = None
-    X: ParticleVector | None = None
+    """Velocity gradients ∇_x v [1/s], in the total description ∇_X v, shape (p, d, d): the affine velocities of APIC,
+    and what viscosity resists."""
+    X: ParticleVector | None = None  # reference positions [m], shape (p, d), in the total description
     histories: tuple[Any, ...] = ()
+    """For each material the history of a law that yields, a pytree of arrays of shape (q,) each (see the law); else
+    None."""
     counts: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    """Number of particles of each of several materials; None if there is one."""
 
     def __post_init__(self):
         materials = len(self.counts) if isinstance(self.counts, tuple) else 1  # what it is is checked below

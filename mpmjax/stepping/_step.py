@@ -24,29 +24,22 @@ from mpmjax.stepping._nodes import Nodes, folded_at_planes, particles_to_grid, w
 
 
 class StepInfo(eqx.Module):
-    """The report of one step.
+    """The report of one step."""
 
-    Attributes:
-        solve: the report of the implicit solve.
-        contact: the report of contact.
-        outside: particles whose stencil left the grid's window.
-        force_error: norm over all nodes, held ones too, of the difference between the elastic force that moved the
-            nodes and the law's force for the same displacement [N]: by the linearisation of one linear solve, and by
-            the return maps of laws that yield, which follow the solve. Zero in explicit steps, and with Newton's method
-            where nothing yields.
-        force_scale: the largest of four such norms [N]: of the two forces, of the force at the start, and of the nodes'
-            momentum over Δt. The momentum of what yields counts only by its rounding, √ε of it.
-        colliders: impulse on the scene's colliders, in the order of its boundaries; None without colliders.
-        boundaries: impulse on each of the scene's boundaries; None unless the scene has `boundary_forces`.
-    """
-
-    solve: SolveInfo
-    contact: ContactInfo
-    outside: Int[Array, "*f"]
+    solve: SolveInfo  # the report of the implicit solve
+    contact: ContactInfo  # the report of contact
+    outside: Int[Array, "*f"]  # particles whose stencil left the grid's window
     force_error: Float[Array, "*f"]
+    """Norm over all nodes, held ones too, of the difference between the elastic force that moved the nodes and the
+    law's force for the same displacement [N]: by the linearisation of one linear solve, and by the return maps of
+    laws that yield, which follow the solve. Zero in explicit steps, and with Newton's method where nothing yields."""
     force_scale: Float[Array, "*f"]
+    """The largest of four such norms [N]: of the two forces, of the force at the start, and of the nodes' momentum
+    over Δt. The momentum of what yields counts only by its rounding, √ε of it."""
     colliders: Impulses | None = None
+    """Impulse on the scene's colliders, in the order of its boundaries; None without colliders."""
     boundaries: Impulses | None = None
+    """Impulse on each of the scene's boundaries; None unless the scene has `boundary_forces`."""
 
     @property
     def linearisation_error(self) -> Float[Array, "*f"]:

@@ -132,7 +132,6 @@ def render(
 
 def _remembered(name: str, scene: Any, particles: Particles) -> np.ndarray:
     """The history variable of that name; NaN at particles whose law has none."""
-    del scene
     values = np.full(particles.count, np.nan)
     for remembered, rows, leaf in history_arrays(particles):
         if remembered == name:
