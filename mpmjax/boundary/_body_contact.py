@@ -75,14 +75,10 @@ class Body(NamedTuple):
 class Patch(eqx.Module):
     """The node itself and its neighbours, 3^d nodes around each node of one layer, with a weight each."""
 
-    weight: Float[Array, "m"]
-    """μ_j ≥ 0, in any unit, shape (m,)."""
-    shape: tuple[int, ...] = eqx.field(static=True)
-    """The grid's shape."""
-    periodic: tuple[bool, ...] = eqx.field(static=True)
-    """Periodic directions."""
-    whole: Float[Array, "m"]
-    """Σ_j μ_j over each patch, shape (m,); 1 where it is zero."""
+    weight: Float[Array, "m"]  # μ_j ≥ 0, in any unit, shape (m,)
+    shape: tuple[int, ...] = eqx.field(static=True)  # the grid's shape
+    periodic: tuple[bool, ...] = eqx.field(static=True)  # periodic directions
+    whole: Float[Array, "m"]  # Σ_j μ_j over each patch, shape (m,); 1 where it is zero
 
     def __init__(self, weight: Float[Array, "m"], shape: tuple[int, ...], periodic: tuple[bool, ...]):
         self.weight, self.shape, self.periodic = weight, shape, periodic
@@ -143,7 +139,6 @@ class Coupling(AbstractSpring):
         return self._on_both(self.patch.spread(amount[0][:, None] * self.normal + amount[1:].T), -1, size)
 
     def diagonal(self, stencil: Stencil, size: int) -> Forces:
-        del stencil
         square = self.normal**2
         along = self.stiffness[0][:, None] * square + self.stiffness[1:].T * (1 - square)
         return self._on_both(self.patch.spread_square(along), 1, size)
@@ -218,7 +213,6 @@ class BodyContact(AbstractSpringContact):
     ) -> Array | float:
         """2 max_j Σ_i k_i q_ij (1/m_j^a + 1/m_j^b) of the present springs, summed over the pairs of bodies, which is a
         bound (derivation, section 12)."""
-        del mass, steepness
         rate = 0.0
         for contact in contacts:
             first, second = (nodal_mass.reshape(-1, len(contact.gap))[body] for body in contact.pair)

@@ -30,14 +30,10 @@ ON_THE_WALL = 1e-3
 class Wall(NamedTuple):
     """A wall at right angles to an axis."""
 
-    axis: int
-    """The axis."""
-    position: float
-    """Coordinate [m]."""
-    inward: int
-    """The sign of the inward normal's component, +1 or −1."""
-    mirrored: bool = False
-    """Whether nodes beyond it are mirror images, so that no particle may start there."""
+    axis: int  # the axis
+    position: float  # coordinate [m]
+    inward: int  # the sign of the inward normal's component, +1 or −1
+    mirrored: bool = False  # whether nodes beyond it are mirror images, so that no particle may start there
 
 
 class AbstractBoundary(eqx.Module):
@@ -49,12 +45,9 @@ class AbstractBoundary(eqx.Module):
 
     collider_count: ClassVar[int] = 0
     """Number of bodies in its `Conditions.colliders`; the impulses on them are recorded."""
-    pushes: ClassVar[bool] = False
-    """Whether it has `surfaces` that push material away."""
-    sees_faces: ClassVar[bool] = False
-    """Whether its `contacts` need the faces of particles though it does not push."""
-    sticks: ClassVar[bool] = False
-    """Whether it holds the whole velocity, and not the normal one alone."""
+    pushes: ClassVar[bool] = False  # whether it has `surfaces` that push material away
+    sees_faces: ClassVar[bool] = False  # whether its `contacts` need the faces of particles though it does not push
+    sticks: ClassVar[bool] = False  # whether it holds the whole velocity, and not the normal one alone
     meets_constraints: ClassVar[bool] = True
     """Whether it may stand in a scene with constrained bodies, such as rigid ones. What it prescribes of a node it
     prescribes of the body."""
@@ -88,7 +81,6 @@ class AbstractBoundary(eqx.Module):
             dt: step [s].
             reach: half the kernel's width in spacings.
         """
-        del start, end, spacing, t, dt, reach
         return None
 
     def contacts(
@@ -104,7 +96,6 @@ class AbstractBoundary(eqx.Module):
             t: time [s].
             dt: step [s].
         """
-        del grid, window
         if faces is None or not self.pushes:
             return ()
         return tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
@@ -132,12 +123,10 @@ class AbstractBoundary(eqx.Module):
             dt: step [s].
             push_time: the time at which they push [s]: t in an explicit step, else t + dt.
         """
-        del x, t, dt, push_time
         return ()
 
     def mirror_images(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> tuple[Image | Tie, ...]:
         """The mirrors that it puts in the window in the step from t to t + dt (see `mirror_image`). Default: none."""
-        del grid, window, t, dt
         return ()
 
     def mirror(self) -> MirrorPlace | None:
@@ -153,7 +142,6 @@ class AbstractBoundary(eqx.Module):
         Raises:
             ValueError: it cannot; why, and what to do.
         """
-        del grid, total
 
     def walls(self) -> tuple[Wall, ...]:
         """The walls at right angles to an axis, for pictures and for warnings of what lies beyond or beside them.
@@ -163,25 +151,21 @@ class AbstractBoundary(eqx.Module):
     def distance(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m"] | None:
         """The signed distance [m] of points x [m], shape (m, d), from the body that it is at time t, for pictures and
         for warnings of what lies in it. Default: None, it is no body."""
-        del x, t
         return None
 
     def extend_to_body(self, fixed: Mask, value: Array, nodes: NodeVector, spacing: Scalar) -> tuple[Mask, Array]:
         """Conditions on single nodes, the components prescribed and a value of each, (n, d), extended to the whole of a
         rigid part. Default: as they are."""
-        del nodes, spacing
         return fixed, value
 
     def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector | None:
         """Where reference nodes at these positions are at time t [m], shape (n, d), if it holds them with all of their
         components. Default: None, that is not known."""
-        del nodes, t
         return None
 
     def pivot(self, t: Scalar) -> Float[Array, "d"] | None:
         """The point at time t [m], shape (d,), about which its torque is taken. Default: None, the origin of the
         coordinates."""
-        del t
         return None
 
     def reach(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -192,7 +176,6 @@ class AbstractBoundary(eqx.Module):
     def rests(self, *, total: bool) -> bool:
         """Whether it acts on the same nodes at all times and is meant to act on some, so that it is an oversight if it
         touches none. Default: False. It is asked only while numbers are known."""
-        del total
         return False
 
 

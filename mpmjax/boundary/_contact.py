@@ -41,33 +41,25 @@ ActiveSet = tuple[Bool[Array, "..."], ...]
 class ContactInfo(eqx.Module):
     """The report of contact: how the active set was found."""
 
-    sweeps: Int[Array, "*f"]
-    """Solves before the last one."""
-    violations: Int[Array, "*f"]
-    """Places that pull or are entered all the same."""
+    sweeps: Int[Array, "*f"]  # solves before the last one
+    violations: Int[Array, "*f"]  # places that pull or are entered all the same
 
 
 class AbstractNodes(eqx.Module):
     """The interface of a step's nodes to contact."""
 
-    mass: eqx.AbstractVar[NodeScalar]
-    """m_i [kg], shape (n,)."""
-    conditions: eqx.AbstractVar[Conditions]
-    """The prescribed motion."""
-    dt: eqx.AbstractVar[Array]
-    """Δt [s]."""
+    mass: eqx.AbstractVar[NodeScalar]  # m_i [kg], shape (n,)
+    conditions: eqx.AbstractVar[Conditions]  # the prescribed motion
+    dt: eqx.AbstractVar[Array]  # δt [s]
     potential: eqx.AbstractVar[Any]
     """The potential Φ of the nodes' displacement, with the mirrors of symmetry planes and of columns that are held."""
-    contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]
-    """The boundaries that may be left."""
+    contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]  # the boundaries that may be left
     walls: eqx.AbstractVar[tuple[tuple[WallImage, ...], ...]]
     """The walls of each boundary that hold what flows at all times; empty without any."""
     brought_by: eqx.AbstractVar[tuple[int | None, ...]]
     """The number of the boundary that brings each contact; None for that of two bodies."""
-    loose: eqx.AbstractVar[Any]
-    """The nodes before the constraints of bodies; None without any."""
-    tied: eqx.AbstractVar[tuple[Any, ...]]
-    """The maps of these constraints."""
+    loose: eqx.AbstractVar[Any]  # the nodes before the constraints of bodies; None without any
+    tied: eqx.AbstractVar[tuple[Any, ...]]  # the maps of these constraints
 
     @property
     @abc.abstractmethod
@@ -200,14 +192,10 @@ class AbstractSpringContact(AbstractContact):
     springs of gap θ g⁰ and stiffness k/θ.
     """
 
-    gap: eqx.AbstractVar[Array]
-    """g at u = 0 [m]."""
-    stiffness: eqx.AbstractVar[Array]
-    """k [N/m], in the same shape."""
-    dt: eqx.AbstractVar[Scalar]
-    """Δt [s]."""
-    share: eqx.AbstractVar[Scalar]
-    """θ; 1 where forces are those at the start of the step."""
+    gap: eqx.AbstractVar[Array]  # g at u = 0 [m]
+    stiffness: eqx.AbstractVar[Array]  # k [N/m], in the same shape
+    dt: eqx.AbstractVar[Scalar]  # δt [s]
+    share: eqx.AbstractVar[Scalar]  # θ; 1 where forces are those at the start of the step
 
     def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
         return explicit
@@ -246,14 +234,10 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     """The nodes while an active set is held; see `constrain`. In its methods `v` is the velocity of all nodes [m/s] and
     `residual` the impulse that is missing at each [kg m/s], shape (n, d)."""
 
-    unconstrained: N
-    """The nodes of which no contact holds anything."""
-    active: ActiveSet
-    """The active set."""
-    images: Mirror
-    """The mirrors in the columns that are held, by contacts or at all times."""
-    nodes: N
-    """The nodes with the active set held."""
+    unconstrained: N  # the nodes of which no contact holds anything
+    active: ActiveSet  # the active set
+    images: Mirror  # the mirrors in the columns that are held, by contacts or at all times
+    nodes: N  # the nodes with the active set held
     displacement: NodeVector | None = None
     """The displacement at which forces that are linear in it have their mean over the step [m], shape (n, d), mirrored
     as velocities are; None for none, as in an explicit step."""

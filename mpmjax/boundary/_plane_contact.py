@@ -35,14 +35,10 @@ class PlaneContact(AbstractContact):
     Friction acts on the first node of a column that has a tangential velocity of its own.
     """
 
-    walls: tuple[WallImage, ...]
-    """The walls' maps."""
-    inward: tuple[Array | int, ...]
-    """The component of each inward normal: +1 or −1."""
-    coefficient: Scalar | None
-    """Coulomb coefficient [-]; None without friction."""
-    shut: Bool[Array, "..."]
-    """The columns that may be held."""
+    walls: tuple[WallImage, ...]  # the walls' maps
+    inward: tuple[Array | int, ...]  # the component of each inward normal: +1 or −1
+    coefficient: Scalar | None  # Coulomb coefficient [-]; None without friction
+    shut: Bool[Array, "..."]  # the columns that may be held
 
     @property
     def axis(self) -> int:

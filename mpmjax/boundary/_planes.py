@@ -25,14 +25,10 @@ FAR = 0.1
 class AbstractPlane(AbstractBoundary):
     """A plane beyond which nodes are mirror images."""
 
-    axis: eqx.AbstractVar[int]
-    """Direction of the normal, 0 to d − 1."""
-    position: eqx.AbstractVar[Scalar]
-    """Coordinate of the plane [m]."""
-    keep: eqx.AbstractVar[str]
-    """Which side holds the material: "above" or "below" the plane."""
-    plain_box: ClassVar[str]
-    """The box that is the same wall anywhere, to first order."""
+    axis: eqx.AbstractVar[int]  # direction of the normal, 0 to d − 1
+    position: eqx.AbstractVar[Scalar]  # coordinate of the plane [m]
+    keep: eqx.AbstractVar[str]  # which side holds the material: "above" or "below" the plane
+    plain_box: ClassVar[str]  # the box that is the same wall anywhere, to first order
 
     def __check_init__(self):
         require_fields(self)
@@ -47,7 +43,6 @@ class AbstractPlane(AbstractBoundary):
 
     def displacement(self, t: Scalar) -> Scalar:
         """How far the plane has moved along its axis at time t [m]. Default: it does not move."""
-        del t
         return 0.0
 
     @property
@@ -57,7 +52,6 @@ class AbstractPlane(AbstractBoundary):
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """Check that the axis is not periodic, and that the plane lies at a multiple of half a spacing."""
-        del total
         name = type(self).__name__
         require(self.axis < grid.dim, f"{name}'s axis must be below {grid.dim}, got {self.axis}.")
         require(
@@ -81,7 +75,6 @@ class AbstractPlane(AbstractBoundary):
     ) -> Bool[Array, "p"] | None:
         """Which particles passed the plane: those that end more than half a spacing beyond it, among others
         (`crossed`)."""
-        del reach
         place = self.inward * jnp.asarray(self.position, end.dtype)
         start, end = start[:, self.axis] - self.displacement(t), end[:, self.axis] - self.displacement(t + dt)
         coordinates = self.inward * start, self.inward * end
@@ -97,8 +90,7 @@ class AbstractPlane(AbstractBoundary):
 class AbstractMovingPlane(AbstractPlane):
     """A plane that may move."""
 
-    motion: eqx.AbstractVar[Any]
-    """How it moves; None for not at all."""
+    motion: eqx.AbstractVar[Any]  # how it moves; None for not at all
 
     @property
     def dim(self) -> int | None:
@@ -198,7 +190,6 @@ class ClampPlane(AbstractMovingPlane):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = V on the plane's own nodes."""
-        del reference
         on = jnp.abs(nodes[:, self.axis] - self.position) <= ON_THE_WALL * spacing
         fixed = jnp.broadcast_to(on[:, None], nodes.shape)
         if self.motion is None:
@@ -265,7 +256,6 @@ class ContactPlane(AbstractPlane):
     meets_constraints: ClassVar[bool] = False
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        del spacing, t, dt, reference
         return no_conditions(nodes)
 
     def check(self, grid: Grid, *, total: bool) -> None:
@@ -279,7 +269,6 @@ class ContactPlane(AbstractPlane):
         than half a particle before the plane; of what yields or flows, or is far behind it, any. In implicit steps,
         which may close much of a gap at once, faces before the plane are pushed as by a `SeparatingBox` in the step
         that would bring them behind it."""
-        del t, dt
         assert faces is not None  # as it `sees_faces`
         normal = jnp.zeros_like(faces.x.T).at[self.axis].set(self.inward)
         distance = self.inward * (faces.x[:, self.axis] - self.position)

@@ -108,7 +108,6 @@ class RigidPart(AbstractBoundary):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = 0 in the directions in which it may not move."""
-        del t, dt, reference
         guided = jnp.zeros(self.dim, bool) if self.free is None else ~jnp.asarray(self.free)
         return Conditions(self.holds(nodes, spacing)[:, None] & guided, jnp.zeros_like(nodes), moves=False)
 
@@ -122,7 +121,6 @@ class RigidPart(AbstractBoundary):
 
     def mirror_images(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> tuple[Image | Tie, ...]:
         """The map that gives all of its nodes the velocity of the first one."""
-        del t, dt
         return (Tie(self.holds(grid.nodes(window), grid.spacing)),)
 
     def check(self, grid: Grid, *, total: bool) -> None:

@@ -41,16 +41,11 @@ class FaceShape(eqx.Module):
     along an edge. Where only the elastic part of the deformation is known or J alone, h = ½ l0 J^(1/d) after each step.
     """
 
-    half: Float[Array, "q"]
-    """½ l0 [m], shape (q,)."""
-    deformation: Deformation
-    """F [-], shape (d, d, q), or J, shape (q,)."""
-    rows: tuple[int, int] = eqx.field(static=True)
-    """First particle, and the one after the last."""
-    total: bool = eqx.field(static=True)
-    """Whether gradients are with respect to the reference positions."""
-    flows: bool = eqx.field(static=True, default=False)
-    """Whether the material resists changes of volume alone."""
+    half: Float[Array, "q"]  # ½ l0 [m], shape (q,)
+    deformation: Deformation  # F [-], shape (d, d, q), or J, shape (q,)
+    rows: tuple[int, int] = eqx.field(static=True)  # first particle, and the one after the last
+    total: bool = eqx.field(static=True)  # whether gradients are with respect to the reference positions
+    flows: bool = eqx.field(static=True, default=False)  # whether the material resists changes of volume alone
 
     def width(self, n: Float[Array, "d q"]) -> tuple[Float[Array, "q"], Float[Array, "d q"]]:
         """h [m], shape (q,), and the arm b [m] from the face to the centre, shape (d, q): δh = n · ∇u b for a
@@ -69,12 +64,9 @@ class FaceShape(eqx.Module):
 class Faces(eqx.Module):
     """The particles as contact with surfaces knows them in a step."""
 
-    x: ParticleVector
-    """Positions at the start of the step [m], shape (p, d)."""
-    v: ParticleVector
-    """Velocities at the start of the step [m/s], shape (p, d)."""
-    shapes: tuple[FaceShape, ...]
-    """Their shapes, one for each material."""
+    x: ParticleVector  # positions at the start of the step [m], shape (p, d)
+    v: ParticleVector  # velocities at the start of the step [m/s], shape (p, d)
+    shapes: tuple[FaceShape, ...]  # their shapes, one for each material
     stiffness: Float[Array, "p"]
     """Stiffness of contact of a face at rest A α M/dx [N/m], shape (p,), with M the modulus of contact (see
     `AbstractLaw.contact_modulus`), α the stiffness of explicit or implicit steps, and A the face's area: V0/l0, and in
@@ -83,16 +75,12 @@ class Faces(eqx.Module):
     """A α ρ0/dx [kg/m²], shape (p,): times the square of the velocity of approach, the stiffness of contact that a
     shock adds."""
     stencil: Stencil  # the nodes of each particle
-    spacing: Scalar
-    """dx [m]."""
-    dt: Scalar
-    """Δt [s]."""
-    push_time: Scalar
-    """The time at which surfaces push [s]: the start of an explicit step, the end of an implicit one."""
+    spacing: Scalar  # dx [m]
+    dt: Scalar  # δt [s]
+    push_time: Scalar  # the time at which surfaces push [s]: the start of an explicit step, the end of an implicit one
     share: Scalar = 1.0
     """θ, the share of the step's displacement at which the integrator evaluates forces; 1 at its start."""
-    explicit: bool = eqx.field(static=True, default=True)
-    """Whether the step is explicit."""
+    explicit: bool = eqx.field(static=True, default=True)  # whether the step is explicit
 
     @property
     def flowing(self) -> Bool[np.ndarray, "p"]:
@@ -134,12 +122,9 @@ class Faces(eqx.Module):
 class Springs(AbstractSpring):
     """The springs between one surface, or two that face each other, and the particles: s is 1 or 2."""
 
-    stretch: Float[Array, "s p"]
-    """g_p at u = 0 [m], shape (s, p); zero where nothing is held."""
-    stiffness: Float[Array, "s p"]
-    """k_p [N/m], shape (s, p); zero where nothing is held."""
-    normal: Float[Array, "d p"]
-    """n_p [-], out of the first surface, shape (d, p); the second one's is the opposite."""
+    stretch: Float[Array, "s p"]  # g_p at u = 0 [m], shape (s, p); zero where nothing is held
+    stiffness: Float[Array, "s p"]  # k_p [N/m], shape (s, p); zero where nothing is held
+    normal: Float[Array, "d p"]  # n_p [-], out of the first surface, shape (d, p); the second one's is the opposite
     arm: Float[Array, "d p"]
     """b_p [m], from the face at the first surface to the centre, shape (d, p); the second one's is the opposite."""
 
@@ -151,12 +136,10 @@ class Springs(AbstractSpring):
         return jnp.stack([sign * shift - growth for sign in SIGNS[: len(self.stretch)]])
 
     def spread(self, amount: Float[Array, "s p"], size: int) -> Forces:
-        del size
         return Forces(value=along(amount) * self.normal, slopes=-amount.sum(axis=0) * self.arm[:, None] * self.normal)
 
     def diagonal(self, stencil: Stencil, size: int) -> Forces:
         """Without the products of weights and their derivatives."""
-        del stencil, size
         k = self.stiffness.sum(axis=0)
         return Forces(value=k * self.normal**2, slopes=k * (self.arm[:, None] * self.normal) ** 2)
 
@@ -169,16 +152,11 @@ def along(amount: Float[Array, "s p"]) -> Float[Array, "p"]:
 class Surface(NamedTuple):
     """A rigid surface, as the particles see it."""
 
-    distance: Float[Array, "p"]
-    """Signed distance of each particle from it [m], shape (p,), below zero behind it."""
-    normal: Float[Array, "d p"]
-    """Unit normal towards the material [-], shape (d, p)."""
-    friction: Scalar
-    """Coulomb coefficient [-]."""
-    velocity: Float[Array, "d p"] | None = None
-    """Velocity of the surface [m/s], shape (d, p); None at rest."""
-    axis: int | None = None
-    """The axis of its normal; None if that is along no axis."""
+    distance: Float[Array, "p"]  # signed distance of each particle from it [m], shape (p,), below zero behind it
+    normal: Float[Array, "d p"]  # unit normal towards the material [-], shape (d, p)
+    friction: Scalar  # Coulomb coefficient [-]
+    velocity: Float[Array, "d p"] | None = None  # velocity of the surface [m/s], shape (d, p); None at rest
+    axis: int | None = None  # the axis of its normal; None if that is along no axis
     opposite: Float[Array, "p"] | None = None
     """Signed distance of each particle from a second surface that faces this one, as the other wall of a vessel does
     [m], shape (p,); None without one."""
@@ -193,22 +171,16 @@ class SurfaceContact(AbstractSpringContact):
     """
 
     gap: Float[Array, "s p"]
-    normal: Float[Array, "d p"]
-    """n_p of the first surface [-], shape (d, p)."""
-    arm: Float[Array, "d p"]
-    """b_p at the first surface [m], shape (d, p) (see `Springs`)."""
+    normal: Float[Array, "d p"]  # n_p of the first surface [-], shape (d, p)
+    arm: Float[Array, "d p"]  # b_p at the first surface [m], shape (d, p) (see `Springs`)
     stiffness: Float[Array, "s p"]
-    velocity: Float[Array, "d p"] | None
-    """Velocity of the surface [m/s], shape (d, p); None at rest."""
+    velocity: Float[Array, "d p"] | None  # velocity of the surface [m/s], shape (d, p); None at rest
     faces: Faces  # the faces that are pushed
     dt: Scalar
     share: Scalar
-    coefficient: Scalar
-    """Coulomb coefficient [-]."""
-    axis: int | None = eqx.field(static=True)
-    """The axis of its normal; None if that is along no axis."""
-    beside: Bool[Array, "s p"] | None = None
-    """The particles that it may push, shape (s, p); None for all."""
+    coefficient: Scalar  # Coulomb coefficient [-]
+    axis: int | None = eqx.field(static=True)  # the axis of its normal; None if that is along no axis
+    beside: Bool[Array, "s p"] | None = None  # the particles that it may push, shape (s, p); None for all
 
     @property
     def near(self) -> Bool[Array, "s p"]:
@@ -229,7 +201,6 @@ class SurfaceContact(AbstractSpringContact):
     def stability_rate(contacts: tuple[Any, ...], nodal_mass: NodeScalar, mass: Array, steepness: Array) -> Array:
         """n k (1 + A b²)/m, with n the largest eigenvalue of the sum of n nᵀ over the surfaces whose springs a particle
         may feel now, at least one, and k that of a face that comes with all of the particle's speed."""
-        del nodal_mass
         square = jnp.stack([(c.arm**2).sum(axis=0) for c in contacts]).max(axis=0)
         each = [c.near.sum(axis=0, dtype=c.normal.dtype) * c.normal[:, None] * c.normal for c in contacts]
         number = jnp.maximum(la.symmetric_eigen(reduce(jnp.add, each))[0].max(axis=0), 1)

@@ -23,10 +23,8 @@ from mpmjax.geometry import Motion
 class AbstractBox(AbstractBoundary):
     """Walls around a box."""
 
-    lower: eqx.AbstractVar[Corner]
-    """Position of the lower wall in each direction [m], (d,); −inf for none."""
-    upper: eqx.AbstractVar[Corner]
-    """Position of the upper wall in each direction [m], (d,); inf for none."""
+    lower: eqx.AbstractVar[Corner]  # position of the lower wall in each direction [m], (d,); −inf for none
+    upper: eqx.AbstractVar[Corner]  # position of the upper wall in each direction [m], (d,); inf for none
 
     def __check_init__(self):
         require_fields(self)
@@ -48,7 +46,6 @@ class AbstractBox(AbstractBoundary):
 
     def displacement(self, t: Scalar) -> Float[Array, "d"] | float:
         """How far the walls have moved at time t [m], shape (d,). Default: they rest."""
-        del t
         return 0.0
 
     def passed(
@@ -91,8 +88,7 @@ class AbstractHoldingBox(AbstractBox):
     """Walls from which material cannot part. They hold the nodes at and behind them, and what flows, while they rest,
     by columns of nodes (see `wall_image`), so that it stays at rest."""
 
-    motion: eqx.AbstractVar[Motion | None]
-    """How the walls move together; None for not at all."""
+    motion: eqx.AbstractVar[Motion | None]  # how the walls move together; None for not at all
 
     def __check_init__(self):
         require_fields(self)
@@ -186,12 +182,10 @@ class SeparatingBox(AbstractBox):
     pushes: ClassVar[bool] = True
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        del spacing, t, dt, reference
         return no_conditions(nodes)
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         """Two an axis, which face each other: what is squeezed is pushed by both."""
-        del t, dt, push_time
         above = (x - jnp.asarray(self.lower, x.dtype)).T
         below = (jnp.asarray(self.upper, x.dtype) - x).T
         normals = [jnp.zeros_like(x.T).at[axis].set(1) for axis in range(x.shape[1])]
@@ -223,7 +217,6 @@ class SeparatingBox(AbstractBox):
 
     def deepest(self, wall: Array, spacing: Scalar, reach: float) -> Array:
         """A spacing beyond the wall: what is deeper is not pushed."""
-        del reach
         return wall - spacing
 
     def check(self, grid: Grid, *, total: bool) -> None:

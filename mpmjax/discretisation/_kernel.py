@@ -103,7 +103,6 @@ class AbstractGradient(eqx.Module):
     def polynomials(self, kernel: BSpline) -> Float[np.ndarray, "s k"] | None:
         """Coefficients of the factor that `derivatives` gives as polynomials, times the spacing: as `kernel.slopes`,
         shape (order + 1, k). Default: None, with which sums are those of XLA, by `derivatives`."""
-        del kernel
         return None
 
     @abstractmethod
@@ -124,7 +123,6 @@ class AbstractGradient(eqx.Module):
             spacing: distance dx between nodes [m].
             inverse_moment: the largest eigenvalue of D_p⁻¹, D_p = Σ_i w_ip (x_i − x_p)(x_i − x_p)ᵀ [1/m²].
         """
-        del kernel, spacing, inverse_moment
         return None
 
 
@@ -135,7 +133,6 @@ class SplineGradient(AbstractGradient):
         return kernel.slopes
 
     def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:
-        del least_squares
         return spline
 
     def steepness(self, kernel: BSpline, spacing: Scalar, inverse_moment: Float[Array, "*p"]) -> Array | None:
@@ -155,9 +152,7 @@ class MLSGradient(AbstractGradient):
         return kernel.moments
 
     def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:
-        del spline
         return least_squares
 
     def steepness(self, kernel: BSpline, spacing: Scalar, inverse_moment: Float[Array, "*p"]) -> Array | None:
-        del kernel, spacing
         return inverse_moment

@@ -30,18 +30,12 @@ class Basis(NamedTuple):
     Σ_k c_ik (t − τ_i)^k in the offset t, around knots τ at which small weights are small by a power and not by a
     difference."""
 
-    shape: tuple[int, ...]
-    """Nodes along each axis."""
-    periodic: tuple[bool, ...]
-    """Whether each axis is."""
-    knots: tuple[float, ...]
-    """τ, of the s nodes along an axis."""
-    weights: tuple[tuple[float, ...], ...]
-    """c of the weights [-]."""
-    slopes: tuple[tuple[float, ...], ...]
-    """c of the gradient's factors [1/spacing]."""
-    moments: tuple[tuple[float, ...], ...]
-    """c of these factors by moving least squares [1/spacing]."""
+    shape: tuple[int, ...]  # nodes along each axis
+    periodic: tuple[bool, ...]  # whether each axis is
+    knots: tuple[float, ...]  # τ, of the s nodes along an axis
+    weights: tuple[tuple[float, ...], ...]  # c of the weights [-]
+    slopes: tuple[tuple[float, ...], ...]  # c of the gradient's factors [1/spacing]
+    moments: tuple[tuple[float, ...], ...]  # c of these factors by moving least squares [1/spacing]
 
     @property
     def value(self) -> tuple[Term]:
@@ -102,10 +96,8 @@ class Stencil(eqx.Module):
     `inside`."""
     offset: Float[Array, "d p"]
     """t, the distance from the middle of the places that have these nodes, in spacings, shape (d, p)."""
-    slope: Float[Array, ""]
-    """Factor of the gradient's polynomials, 1/dx [1/m]."""
-    inside: Bool[Array, "p"]
-    """Whether the whole stencil of the particle lies in the window."""
+    slope: Float[Array, ""]  # factor of the gradient's polynomials, 1/dx [1/m]
+    inside: Bool[Array, "p"]  # whether the whole stencil of the particle lies in the window
     basis: Basis = eqx.field(static=True)  # the polynomials, and the window
     own_derivatives: Float[Array, "d s p"] | None = None
     """The gradient's factors along each axis [1/m], shape (d, s, p), of a gradient operator that is not given by

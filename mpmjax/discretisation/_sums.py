@@ -40,8 +40,7 @@ class Group(NamedTuple):
     """Terms that share an array."""
 
     terms: tuple[Term, ...]
-    moved: bool = False
-    """Whether they are differentiated along dt."""
+    moved: bool = False  # whether they are differentiated along dt
 
 
 Groups = tuple[Group, ...]
@@ -278,7 +277,6 @@ def _of_unknown(rows: Sequence[Any], out: Sequence[Array]) -> list:
 @scatter_sum.deftranspose
 def _(nodes: Array, args: tuple, *, groups: Groups, size: int, **params: Any) -> tuple:
     """By dt the pull of what is moved, by what is given the gather: in one pass where both are asked for."""
-    del size
     first, t, dt, rows = args
     pairs = list(zip(groups, rows, strict=True))
     wanted = tuple(group for group, a in pairs if is_unknown(a))

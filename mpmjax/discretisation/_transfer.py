@@ -24,10 +24,8 @@ from mpmjax.discretisation._sums import gather, scatter
 class Gathered(eqx.Module):
     """A velocity field of the nodes, gathered at the particles."""
 
-    value: Float[Array, "d p"]
-    """Σ_i w_ip v_i [m/s], shape (d, p)."""
-    gradient: Matrix
-    """Σ_i v_i g_ipᵀ [1/s], shape (d, d, p), by the scene's gradient operator."""
+    value: Float[Array, "d p"]  # Σ_i w_ip v_i [m/s], shape (d, p)
+    gradient: Matrix  # Σ_i v_i g_ipᵀ [1/s], shape (d, d, p), by the scene's gradient operator
     affine: Matrix | None
     """Σ_i v_i g_ipᵀ [1/s], shape (d, d, p), by moving least squares; None unless the transfer is `affine`."""
 
@@ -35,18 +33,12 @@ class Gathered(eqx.Module):
 class ParticleMotion(NamedTuple):
     """The result of G2P at the particles."""
 
-    carrier: Float[Array, "d p"]
-    """The velocity with which they move, Σ_i w_ip v̄_i [m/s], shape (d, p)."""
-    velocity: Float[Array, "d p"]
-    """Their new velocity [m/s], shape (d, p)."""
-    affine: Matrix | None
-    """Their new C [1/s], shape (d, d, p); None if they keep none."""
-    gradient: Matrix
-    """The velocity gradient that deforms them, Σ_i v̄_i g_ipᵀ [1/s], shape (d, d, p)."""
-    x: Float[Array, "d p"]
-    """Their new positions [m], shape (d, p)."""
-    F: Matrix | None
-    """Their new deformation gradient [-], shape (d, d, p); None unless they were given one."""
+    carrier: Float[Array, "d p"]  # the velocity with which they move, Σ_i w_ip v̄_i [m/s], shape (d, p)
+    velocity: Float[Array, "d p"]  # their new velocity [m/s], shape (d, p)
+    affine: Matrix | None  # their new C [1/s], shape (d, d, p); None if they keep none
+    gradient: Matrix  # the velocity gradient that deforms them, Σ_i v̄_i g_ipᵀ [1/s], shape (d, d, p)
+    x: Float[Array, "d p"]  # their new positions [m], shape (d, p)
+    F: Matrix | None  # their new deformation gradient [-], shape (d, d, p); None unless they were given one
 
 
 class AbstractTransfer(eqx.Module):
@@ -77,7 +69,6 @@ class AbstractTransfer(eqx.Module):
             new: as in `velocity`.
             change: as in `velocity`.
         """
-        del C, change
         return new.affine
 
     def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
@@ -88,7 +79,6 @@ class AbstractTransfer(eqx.Module):
             inverse_moment: a, the largest eigenvalue of D_p⁻¹ [1/m²].
             gradient_bound: Ξ, a bound of Σ_i g_ip g_ipᵀ/w_ip [1/m²].
         """
-        del inverse_moment, gradient_bound
         return None
 
 
@@ -100,12 +90,10 @@ class PIC(AbstractTransfer):
     """
 
     def velocity(self, v: Float[Array, "d p"], new: Gathered, change: Gathered | None) -> Float[Array, "d p"]:
-        del v, change
         return new.value
 
     def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
         """2Ξ and 4Ξ."""
-        del inverse_moment
         return 2 * gradient_bound, 4 * gradient_bound
 
 
@@ -133,7 +121,6 @@ class FLIP(AbstractTransfer):
 
     def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
         """2Ξ and 4Ξ."""
-        del inverse_moment
         return 2 * gradient_bound, 4 * gradient_bound
 
 
@@ -148,7 +135,6 @@ class APIC(AbstractTransfer):
     affine: ClassVar[bool] = True
 
     def velocity(self, v: Float[Array, "d p"], new: Gathered, change: Gathered | None) -> Float[Array, "d p"]:
-        del v, change
         return new.value
 
     def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
@@ -247,7 +233,6 @@ def g2p_sum(
     stencil: Stencil, nodes: NodeVector, dt: Scalar, x: Float[Array, "d p"], F: Matrix | None, *, basis: Basis
 ) -> tuple[Float[Array, "d p"], Matrix, Float[Array, "d p"], Matrix | None]:
     """A velocity v of the nodes at the particles, its gradient, x + Δt v and F + Δt (∇v) F."""
-    del basis  # of the stencil, for back ends
     value, slopes = gather(stencil, nodes, saved=True)
     gradient = la.transpose(slopes)
     return value, gradient, x + dt * value, None if F is None else F + dt * la.matmul(gradient, F)

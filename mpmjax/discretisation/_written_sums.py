@@ -22,10 +22,8 @@ three take it three times as long as four, being added one by one."""
 class Factors(NamedTuple):
     """Factors of terms, stored: XLA would else compute it again in each of the sums' loops."""
 
-    shares: Array
-    """Terms of the flat node index, shape (d, s, p)."""
-    along: tuple[dict[Kind, Array], ...]
-    """The polynomials of each kind along each axis, shape (s, p)."""
+    shares: Array  # terms of the flat node index, shape (d, s, p)
+    along: tuple[dict[Kind, Array], ...]  # the polynomials of each kind along each axis, shape (s, p)
 
     @classmethod
     def of(cls, basis: Basis, first: Array, t: Array, terms: Sequence[Term]) -> "Factors":

@@ -114,7 +114,6 @@ class Inlet(eqx.Module):
         self, scene: Scene, particles: Particles, t: Scalar, dt: Scalar, memory: Any
     ) -> tuple[Scene, Particles, Any]:
         """The particles with the stock where it is at time t."""
-        del dt
         require(
             self.first + self.stock.count <= particles.count,
             f"An Inlet's stock of {self.stock.count} particles from number {self.first} on must be among the "
@@ -156,7 +155,6 @@ class Outlet(eqx.Module):
         self, scene: Scene, particles: Particles, t: Scalar, dt: Scalar, memory: Any
     ) -> tuple[Scene, Particles, Any]:
         """The particles without mass where they are taken."""
-        del dt
         x, d = particles.x, self.region.dim
         require(d == particles.dim, f"An Outlet's region must have {particles.dim} coordinates, as the run, got {d}.")
         taken = (self.region.contains(x) & (t >= self.start)) | (particles.mass == 0)

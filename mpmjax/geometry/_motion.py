@@ -19,8 +19,7 @@ class AbstractMotion(eqx.Module):
     """The motion of a rigid body, from positions X before the motion to positions x at time t: at least a displacement,
     piecewise linear in time, at rest before its first time and after its last."""
 
-    turns: ClassVar[bool] = True
-    """Whether it may turn the body."""
+    turns: ClassVar[bool] = True  # whether it may turn the body
     times: eqx.AbstractVar[Times]
     displacement: eqx.AbstractVar[Displacements]
 

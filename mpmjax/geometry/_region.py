@@ -22,10 +22,8 @@ Cells = tuple[np.ndarray, np.ndarray]
 class AbstractRegion(eqx.Module):
     """A closed set of points."""
 
-    flat: ClassVar[bool] = False
-    """Whether its normal is the same everywhere."""
-    fills_bounds: ClassVar[bool] = False
-    """Whether every point of its bounding box lies in it."""
+    flat: ClassVar[bool] = False  # whether its normal is the same everywhere
+    fills_bounds: ClassVar[bool] = False  # whether every point of its bounding box lies in it
 
     @property
     @abc.abstractmethod

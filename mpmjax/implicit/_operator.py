@@ -23,8 +23,7 @@ class Projection(eqx.Module):
     Without normals it is a mask.
     """
 
-    free: Mask
-    """Whether nothing prescribes a component, shape (n, d)."""
+    free: Mask  # whether nothing prescribes a component, shape (n, d)
     normals: tuple[NodeVector, ...] = ()
     """Held unit normals, each (n, d), at right angles where a node has several; zero in components that are not free,
     and at nodes without one."""
@@ -60,12 +59,9 @@ class ImplicitOperator(eqx.Module):
     identity; along a held normal the operator is the mass.
     """
 
-    mass: NodeScalar
-    """Nodal masses m_i [kg], shape (n,)."""
-    factor: Scalar
-    """χ [s²]."""
-    hessian: AbstractHessianAction
-    """H [N/m]."""
+    mass: NodeScalar  # nodal masses m_i [kg], shape (n,)
+    factor: Scalar  # χ [s²]
+    hessian: AbstractHessianAction  # H [N/m]
     projection: Projection  # Q
     viscosity: tuple[ElasticPotential, Scalar] | None = None
     """The potential whose viscous force −D v is in the equation, and r [1/s]: H is then H + r D. None if there is no

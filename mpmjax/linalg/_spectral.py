@@ -90,10 +90,8 @@ class Logarithm(AbstractSpectral):
 class PowerLessOne(AbstractSpectral):
     """eᶜ Sᵃ − I of positive definite S. It is zero for a = c = 0, and of full relative precision near there."""
 
-    exponent: Array
-    """a [-], shape (*batch)."""
-    shift: Array
-    """c [-], shape (*batch)."""
+    exponent: Array  # a [-], shape (*batch)
+    shift: Array  # c [-], shape (*batch)
 
     def of(self, s: Array) -> Array:
         """exp(a ln s + c) − 1."""
@@ -139,8 +137,7 @@ class _Partial(AbstractSpectral):
     """The derivative of f with respect to one of its parameters, a function of the same eigenvalue."""
 
     function: AbstractSpectral
-    parameter: int = eqx.field(static=True)
-    """The index of the parameter among the leaves of f."""
+    parameter: int = eqx.field(static=True)  # the index of the parameter among the leaves of f
 
     def of(self, s: Array) -> Array:
         return self._rate(lambda f: f.of(s))
@@ -163,7 +160,6 @@ class _Partial(AbstractSpectral):
 @custom_derivative
 def _differential(f: AbstractSpectral, S: Matrix, frame: Frame, directions: tuple[Matrix, ...]) -> Matrix:
     """Dⁿf(S)[A, B, ...] in n directions. It is computed from the frame, and differentiated with respect to S."""
-    del S
     s, V = frame
     order = len(directions)
     if order == 0:

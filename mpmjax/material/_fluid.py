@@ -110,7 +110,7 @@ class Fluid(AbstractInelastic):
     __check_init__ = require_fields
 
     def initial_history(self, J: Array, /) -> None:
-        del J
+        return None
 
     def elastic(self, history: None) -> Tait:
         return Tait(self.bulk_modulus, self.exponent, self.tension)

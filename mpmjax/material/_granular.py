@@ -69,7 +69,6 @@ class DruckerPrager(AbstractHenckyPlasticity):
         self, history: DruckerPragerHistory, mean: Array, deviation: Array, dt: Scalar
     ) -> tuple[Array, Array, Array]:
         """To the cone at the same volume, or to its tip."""
-        del dt
         mean = mean + history.gap / 3
         apart = mean > 0
         sine = jnp.sin(self.friction_angle)
@@ -145,7 +144,6 @@ class CamClay(AbstractHenckyPlasticity):
 
     def flow(self, history: CamClayHistory, mean: Array, deviation: Array, dt: Scalar) -> tuple[Array, Array, Array]:
         """To a tip, or to the ellipse at the same pressure; all stresses are divided by K."""
-        del dt
         alpha, beta, M = history.volume_strain, self.cohesion, self.friction
         nu = self.poisson_ratio
         p0 = jnp.sinh(self.hardening * jnp.where(alpha < 0, -alpha, 0))
@@ -221,7 +219,6 @@ class Snow(AbstractInelastic):
 
     def return_map(self, F: Matrix, history: SnowHistory, dt: Scalar) -> tuple[Matrix, SnowHistory]:
         """Clamp the principal stretches of F_E; J_P ← J_P det F_trial / det F_E."""
-        del dt
         least, most = (jnp.asarray(a, F.dtype) for a in (1 - self.critical_compression, 1 + self.critical_stretch))
         excess = _Clamp(least, most)(la.matmul(la.transpose(F), F))
         clamped = F + la.matmul(F, excess)

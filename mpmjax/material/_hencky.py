@@ -198,7 +198,6 @@ class VonMises(AbstractHenckyPlasticity):
 
     def flow(self, history: VonMisesHistory, mean: Array, deviation: Array, dt: Scalar) -> tuple[Array, Array, Array]:
         """Radial return of the deviator."""
-        del dt
         stiffness = 2 * self.elastic(history).shear_modulus
         allowed = (2 / 3) ** 0.5 * (self.yield_stress + self.hardening_modulus * history.plastic_strain)
         excess = stiffness * deviation - allowed

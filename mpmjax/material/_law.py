@@ -89,16 +89,14 @@ class AbstractLaw(eqx.Module):
     """The interface of any law. Laws derive from `AbstractMaterial` (elastic) or `AbstractInelastic` (with a
     history), which answer most of it."""
 
-    measure: ClassVar[DeformationMeasure] = DEFORMATION_GRADIENT
-    """The deformation that its particles store."""
+    measure: ClassVar[DeformationMeasure] = DEFORMATION_GRADIENT  # the deformation that its particles store
     allows_total: ClassVar[bool] = True
     """Whether it may stand in the total description, in which the deformation is that from the start."""
     allows_averaged_volume: ClassVar[bool] = True
     """Whether the volumes of its particles may be averaged (see `AveragedVolume`)."""
     relaxes_stress: ClassVar[bool] = False
     """Whether its return map changes the stress, so that implicit solves resist by another one than the law's."""
-    viscosity: ClassVar[Viscosity | None] = None
-    """The viscosity beside the law."""
+    viscosity: ClassVar[Viscosity | None] = None  # the viscosity beside the law
     constraint: ClassVar[Any] = None
     """The constraint on how a body of it moves, an `mpmjax.state.AbstractConstraint`, as a method of the material's
     number and of its layer of nodes. None of what deforms freely."""
@@ -268,7 +266,6 @@ class AbstractMaterial(AbstractLaw):
     def stiffness_eigenvalues(self, F: Matrix, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
         """Eigenvalues [Pa] of the tangent L ↦ (∂²Ψ/∂F∂F : (L F)) Fᵀ + τ Lᵀ, L = ∇v, τ = P Fᵀ, made symmetric; in the
         total description of ∂²Ψ/∂F∂F. The largest, which `stable_dt` needs, is among them."""
-        del dim
         # in the principal frame the map is d x d on the diagonal and 2 x 2 on (L_ij, L_ji) for each pair
         _, s, _ = la.principal_frame(F)
         tangent = self.principal_differential(s)
@@ -304,7 +301,7 @@ class AbstractMaterial(AbstractLaw):
         return jnp.isfinite(_density(self, F))
 
     def initial_history(self, F: Deformation, /) -> None:
-        del F
+        return None
 
     def elastic(self, history: None) -> "AbstractMaterial":
         return self

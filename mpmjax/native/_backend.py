@@ -18,16 +18,12 @@ VARIABLE = "MPMJAX_BACKEND"
 class AbstractBackend(eqx.Module):
     """Who evaluates functions on a platform: which kernels there are, of which arguments, and how XLA calls them."""
 
-    reason: str
-    """Why it is this one."""
-    name: ClassVar[str]
-    """The name in MPMJAX_BACKEND and in reports."""
-    platform: ClassVar[str]
-    """The platform of JAX, such as cpu."""
+    reason: str  # why it is this one
+    name: ClassVar[str]  # the name in MPMJAX_BACKEND and in reports
+    platform: ClassVar[str]  # the platform of JAX, such as cpu
     gains_from_order: ClassVar[bool] = False
     """Whether sorting particles by cell saves more time in its sums than it takes."""
-    by_default: ClassVar[bool] = True
-    """Whether it is taken without being asked for."""
+    by_default: ClassVar[bool] = True  # whether it is taken without being asked for
 
     @staticmethod
     def absence() -> str:

@@ -36,8 +36,7 @@ class Library(NamedTuple):
     """A library, or why there is none."""
 
     handle: ctypes.CDLL | None
-    reason: str
-    """Why it is not used; empty if it is."""
+    reason: str  # why it is not used; empty if it is
 
 
 @functools.cache

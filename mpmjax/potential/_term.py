@@ -100,8 +100,7 @@ class AbstractTerm(eqx.Module):
     the energy, unless the term has faster ones. `stable_dt` needs `stability_rates`.
     """
 
-    viscous: ClassVar[bool] = False
-    """Whether it has a `resistance`."""
+    viscous: ClassVar[bool] = False  # whether it has a `resistance`
 
     @abc.abstractmethod
     def energy(self, moved: Displacement) -> Float[Array, ""]:

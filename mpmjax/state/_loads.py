@@ -35,12 +35,10 @@ class AbstractLoad(eqx.Module):
     or both.
     """
 
-    on: eqx.AbstractVar[AbstractPlace]
-    """Where it acts."""
+    on: eqx.AbstractVar[AbstractPlace]  # where it acts
     moves_points_on: ClassVar[bool] = True
     """Whether `force` has the points where they are at its time t; else where they are as the step begins."""
-    may_be_revolved: ClassVar[bool] = True
-    """Whether it may act on bodies of revolution, points of which are rings."""
+    may_be_revolved: ClassVar[bool] = True  # whether it may act on bodies of revolution, points of which are rings
 
     @abc.abstractmethod
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"] | None:
@@ -144,7 +142,6 @@ class Pressure(AbstractLoad):
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
         """−p cof(F) A, or −p A."""
-        del dt
         area, F = points.area, points.deformation
         if area is None:
             raise ValueError("Pressure acts on a surface: give it a Patch, not points.")
@@ -373,7 +370,6 @@ class Couple(AbstractLoad):
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
         """w α × r."""
-        del dt
         weight, x = points.weight, points.x.T
         arms = x - (weight[:, None] * x).sum(axis=0) / weight.sum()
         alpha = jnp.linalg.solve(inertia(arms, weight), jnp.atleast_1d(value_at(self.total, t)))

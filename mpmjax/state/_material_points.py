@@ -219,7 +219,6 @@ class AveragedStiffness(AbstractStiffness):
 
     def diagonal(self, stencil: Stencil, size: int) -> Forces:
         """The diagonal of each particle's matrix if volumes were not averaged, without that of K [J]."""
-        del size
         c = self.volumetric / self.average.volume
         return self._of_all(2 * self.coupling * c + self.bulk * c**2, len(stencil.inside))
 

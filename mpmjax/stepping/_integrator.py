@@ -15,12 +15,10 @@ from mpmjax.stepping._nodes import Nodes
 class NodeMotion(eqx.Module):
     """The motion of the nodes over a step."""
 
-    velocity: NodeVector
-    """v^{n+1} [m/s], shape (n, d)."""
+    velocity: NodeVector  # v^{n+1} [m/s], shape (n, d)
     mean: NodeVector | None = None
     """The velocity with which positions and deformation move [m/s], shape (n, d); None if it is v^{n+1}."""
-    inner: NodeVector | None = None
-    """The displacement at an inner stage over Δt [m/s], shape (n, d); None without one."""
+    inner: NodeVector | None = None  # the displacement at an inner stage over Δt [m/s], shape (n, d); None without one
     resisted: NodeVector | None = None
     """The velocity in the viscous force [m/s], shape (n, d); None without viscosity, or with explicit viscosity."""
     friction: NodeVector | None = None
@@ -116,7 +114,6 @@ class AbstractIntegrator(eqx.Module):
     def reporting(self, slot: Scalar) -> "AbstractIntegrator":
         """This integrator, with tangent and adjoint solves that report through a slot (see `Reporting`). Default: the
         integrator itself, without such solves."""
-        del slot
         return self
 
     def unconverged_advice(self) -> tuple[str, ...]:
@@ -139,7 +136,6 @@ class Explicit(AbstractIntegrator):
     needs_separate_force: ClassVar[bool] = False
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
-        del guess
         v = nodes.explicit_velocity()
         if nodes.conditions.holds:
             v = nodes.projection.combine(v, nodes.prescribed)
@@ -148,7 +144,6 @@ class Explicit(AbstractIntegrator):
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(0) [kg m/s], on nodes that have mass."""
-        del motion
         return jnp.where(nodes.occupied, nodes.dt * nodes.force, 0)
 
     def stability_factor(self) -> Scalar:

@@ -156,7 +156,6 @@ class RestOutside(AbstractBoundary):
         return 2
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        del spacing, t, dt, reference
         outside = _VORTEX_RING.distance(nodes)[:, None] >= 0
         return Conditions(jnp.broadcast_to(outside, nodes.shape), jnp.zeros_like(nodes))
 
