@@ -148,7 +148,7 @@ def test_what_a_fit_says_follows_from_its_residuals(fall):
         lambda p: drawn.residuals(p, result.sigmas[0]), (jnp.asarray(value),), (jnp.asarray(J[..., 0]),)
     )
     parts = {"residuals": np.asarray(r), "jacobian": np.asarray(column)[:, None]}
-    moved = replace(result, experiments=(e.with_observations((drawn,), e.t1),), **parts)
+    moved = replace(result, experiments=(replace(e, observations=(drawn,)),), **parts)
     assert np.allclose(moved.fitted[0][0], value)
     assert np.allclose(moved.fitted[1][0], J[..., :1])
 

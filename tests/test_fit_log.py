@@ -139,7 +139,7 @@ def test_a_script_reads_the_log(whole):
 
 
 def other_data(e):
-    return e.with_observations((eqx.tree_at(lambda o: o.data, e.observations[0], e.observations[0].data + 1e-9),))
+    return replace(e, observations=eqx.tree_at(lambda o: o.data, e.observations[0], e.observations[0].data + 1e-9))
 
 
 OTHERS = {

@@ -1,7 +1,7 @@
 """The growth of a rollout's derivatives over its horizon."""
 
 import warnings
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import diffrax
 import equinox as eqx
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, ParticleVector, Scalar
-from mpmjax.checks import checked, is_traced, require, require_positive, require_whole
+from mpmjax.checks import checked, is_traced, positive, require, require_whole
 from mpmjax.simulation import Fault, RunStatistics, number_of_steps, simulate
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
@@ -47,7 +47,7 @@ def sensitivity(
     seed: int = 0,
     save_every: int | None = None,
     start: Scalar = 0,
-    warn_at: float | int = 1e3,
+    warn_at: Annotated[float | int, positive] = 1e3,
 ) -> Sensitivity:
     """Tells whether gradients over this horizon are useful: the growth of a small change of the initial velocities.
 
@@ -80,7 +80,6 @@ def sensitivity(
     Raises:
         ValueError: as `simulate`; a change of the wrong shape, or zero.
     """
-    require_positive("warn_at", warn_at)
     start = require_whole("start", start, 0)
     particles = prepare(scene, particles)
     dt = step_for(scene, particles, t1, dt, method, start)

@@ -9,10 +9,10 @@ at time zero is used.
 import itertools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from mpmjax.analysis._bench import FRAMES, HOPELESS, Bench, Build, Clock, Trial, name_of, settle
-from mpmjax.checks import checked, require_positive
+from mpmjax.checks import checked, positive
 from mpmjax.simulation import LARGEST_LINEARISATION_ERROR
 from mpmjax.stepping import TRBDF2, AbstractIntegrator, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 
@@ -90,12 +90,12 @@ class WorkPrecision(NamedTuple):
 def work_precision(
     build: Build,
     *,
-    t1: float,
-    error: float = 1e-2,
+    t1: Annotated[float, positive, "s"],
+    error: Annotated[float, positive] = 1e-2,
     methods: tuple[AbstractIntegrator, ...] = METHODS,
     refinements: tuple[int, ...] = (1, 2),
     also: tuple[tuple[AbstractIntegrator, float], ...] = (),
-    most_seconds: float = 60.0,
+    most_seconds: Annotated[float, positive] = 60.0,
     progress: Callable[[Trial], None] = lambda trial: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> WorkPrecision:
@@ -128,9 +128,6 @@ def work_precision(
     Raises:
         ValueError: from `prepare`; nothing moves, or no reference run ended well.
     """
-    require_positive("t1 [s]", t1)
-    require_positive("error", error)
-    require_positive("most_seconds", most_seconds)
     clock, bench = Clock(most_seconds), Bench.of(build, 1, t1)
     limit, reference, truth = settle(build, bench, error, _REFERENCE_SHARE * most_seconds, say)
     trials: list[Trial] = []

@@ -9,6 +9,7 @@ from mpmjax.checks._kinds import (
     is_own as is_own,
     marks_of as marks_of,
     require_fields as require_fields,
+    require_marks as require_marks,
     shape_of as shape_of,
 )
 from mpmjax.checks._values import (

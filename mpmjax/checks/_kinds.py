@@ -44,9 +44,9 @@ _WORDS: dict[Any, str] = {
 
 
 def checked(function: Function) -> Function:
-    """Decorate a public function to check that its arguments are of the kinds that their annotations name (else a
-    ValueError), and to allow broadcasting of different ranks within it, whatever `jax_numpy_rank_promotion` says
-    outside."""
+    """Decorate a public function to check that its arguments are of the kinds that their annotations name and have the
+    values that marks ask for (see `require_fields`; else a ValueError), and to allow broadcasting of different ranks
+    within it, whatever `jax_numpy_rank_promotion` says outside."""
     signature = inspect.signature(function)
     hints = {p.name: p.annotation for p in signature.parameters.values() if p.annotation is not p.empty}
     owner = function.__qualname__.removesuffix(".__init__")
@@ -57,6 +57,7 @@ def checked(function: Function) -> Function:
             several = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
             for value in argument if several else (argument,) if name in hints else ():
                 require_kind(f"{owner}'s {name}", value, hints[name])
+                require_marks(f"{owner}'s {name}", value, marks_of(hints[name]))
         with jax.numpy_rank_promotion("allow"):
             return function(*args, **kwargs)
 
@@ -75,9 +76,7 @@ def require_fields(module: eqx.Module) -> None:
         except TypeError:
             shown = shortened(repr(value))
             raise ValueError(f"{what} fixes a program: give a known number or a tuple, got {shown}.") from None
-        what += "".join(f" [{unit}]" for unit in marks if isinstance(unit, str))
-        for check in (mark for mark in marks if callable(mark) and value is not None):
-            check(what, value)
+        require_marks(what, value, marks)
 
 
 @cache
@@ -91,6 +90,13 @@ def require_kind(name: str, value: Any, hint: Any) -> None:
     if not _takes(hint, value):
         shown = f"the class {value.__name__}" if isinstance(value, type) else shortened(repr(value))
         raise ValueError(f"{name} must be {_in_words(hint)}, got {shown}{_meant(hint, value)}")
+
+
+def require_marks(name: str, value: Any, marks: list[Any]) -> None:
+    """Call the functions among an annotation's marks on a value that is not None, its name with the unit among them."""
+    name += "".join(f" [{unit}]" for unit in marks if isinstance(unit, str))
+    for check in (mark for mark in marks if callable(mark) and value is not None):
+        check(name, value)
 
 
 def alternatives(hint: Any) -> list[Any]:

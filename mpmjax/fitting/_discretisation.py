@@ -1,5 +1,7 @@
 """How far a minimum moves on twice the spacing and step: the part of its error that the discretisation makes."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -18,15 +20,7 @@ def coarsened(experiment: Experiment, longer: int) -> Experiment:
         ValueError: the coarse grid does not fit a wall that must lie on its nodes, or a period.
     """
     scene = eqx.tree_at(lambda s: s.grid, experiment.scene, experiment.scene.grid.coarsened())
-    return Experiment(
-        scene,
-        experiment.particles,
-        t1=experiment.t1,
-        dt=experiment.t1 / -(-experiment.steps // longer),
-        observations=experiment.observations,
-        method=experiment.method,
-        name=experiment.name,
-    )
+    return replace(experiment, scene=scene, dt=experiment.t1 / -(-experiment.steps // longer))
 
 
 def changes_on_coarse_grid(

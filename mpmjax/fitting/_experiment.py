@@ -2,6 +2,7 @@
 
 import abc
 import itertools
+from dataclasses import replace
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -259,13 +260,6 @@ class Experiment(eqx.Module):
         """Number of steps."""
         return number_of_steps(self.t1, self.dt, 0, self.dtype)
 
-    def with_observations(
-        self, observations: tuple[AbstractObservation, ...], t1: float | int | None = None
-    ) -> "Experiment":
-        """The experiment with other observations, and to another end."""
-        t1, same = self.t1 if t1 is None else t1, {"method": self.method, "name": self.name}
-        return Experiment(self.scene, self.particles, t1=t1, dt=self.dt, observations=observations, **same)
-
     def until(self, t1: float) -> "Experiment":
         """The experiment, ended at the first step from a time [s] on, with the data until then; itself where there are
         none, or the time is not before its end. Observations without times, such as a `Curve`, are left out."""
@@ -274,7 +268,7 @@ class Experiment(eqx.Module):
         steps = int(np.ceil(t1 / self.dt - _ON_A_STEP))
         if not kept or steps >= self.steps:
             return self
-        return self.with_observations(kept, steps * self.dt)
+        return replace(self, observations=kept, t1=steps * self.dt)
 
     def run(self, *, adjoint: Any = None, throw: bool = True, checkpoint_bytes: int = 2**28) -> Run:
         """The simulation of it, with what its observations observe after each step (see `simulate`)."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Scalar
-from mpmjax.checks import checked, require, warn
+from mpmjax.checks import between, checked, require, warn
 from mpmjax.fitting._discretisation import changes_on_coarse_grid
 from mpmjax.fitting._estimate import table
 from mpmjax.fitting._experiment import Experiment
@@ -36,6 +36,8 @@ from mpmjax.fitting._search import (
 from mpmjax.fitting._starts import Starts, as_starts, look_around, starting_points, unit_points
 from mpmjax.fitting._uncertainty import seen_together, uncertainty
 
+Level = Annotated[Scalar, between(0, 1, open_ends=True)]
+
 
 @checked
 def fit(
@@ -45,7 +47,7 @@ def fit(
     starts: int | Literal["auto"] | Starts = "auto",
     discretisation: bool | Literal["auto"] = "auto",
     report: dict[str, Callable[[Experiment], Any]] | None = None,
-    level: Scalar = 0.95,
+    level: Level = 0.95,
     optimiser: AbstractOptimiser | None = None,
     memory: int = 2**28,
     progress: Callable[[str], None] | None = None,
@@ -108,7 +110,7 @@ def fit(
     require(log is not None or not resume, "resume continues the fit of a log: name it by log.")
     problem = FitProblem(experiments, parameters, memory)
     optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
-    level, report = checked_level(level), dict(report or {})
+    level, report = float(level), dict(report or {})
     for name, of in report.items():
         require(name not in problem.labels, f"What is reported must not have a parameter's name, got {name!r}.")
         shape = jnp.shape(of(problem.experiments[0]))
@@ -183,12 +185,6 @@ def chosen_optimiser(problem: FitProblem) -> AbstractOptimiser:
     iterations of the same cost for any number of parameters (docs/fitting.md has the measurement)."""
     columns = min(problem.size, ROW_COST * problem.measured)
     return LevenbergMarquardt() if columns <= MOST_COLUMNS else LBFGS()
-
-
-def checked_level(level: Scalar) -> float:
-    """The level of intervals, which must lie between 0 and 1."""
-    require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
-    return float(level)
 
 
 def _in_rounds(
@@ -329,7 +325,7 @@ def fit_ensemble(
     *,
     batch: int | None = None,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
-    level: Scalar = 0.95,
+    level: Level = 0.95,
     optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> EnsembleFit:
@@ -353,7 +349,6 @@ def fit_ensemble(
         ValueError: as `fit`; data sets of different shapes; no fit that did not fail.
     """
     require(len(experiments) > 0, "An ensemble needs a data set at least.")
-    level = checked_level(level)
     for k, e in enumerate(experiments):
         each = e if isinstance(e, (tuple, list)) else (e,)
         usable = len(each) > 0 and all(isinstance(part, Experiment) for part in each)
@@ -365,7 +360,7 @@ def fit_ensemble(
     noise = [p.first_sigmas for p in problems]
     outcomes = _in_rounds(problems, noise, optimiser=optimiser, starts=zeros, progress=progress, batch=size)
     fits = [
-        None if settled is None else fit_result(problem, optimiser, end, settled, dict(report or {}), level)
+        None if settled is None else fit_result(problem, optimiser, end, settled, dict(report or {}), float(level))
         for problem, (end, settled, *_) in zip(problems, outcomes, strict=True)
     ]
     failures = {k: end.failure for k, (end, *_) in enumerate(outcomes) if end.failure}

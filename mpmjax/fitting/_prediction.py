@@ -1,19 +1,20 @@
 """Errors that follow from a fit: of its predictions, and of its parameters by data drawn anew."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import checked, require, require_positive, require_whole, warn
+from mpmjax._types import Array, Float
+from mpmjax.checks import checked, positive, require, warn, whole
 from mpmjax.fitting._estimate import VALUE, AbstractFit, Estimate, table
 from mpmjax.fitting._experiment import Experiment, Numbers
-from mpmjax.fitting._fit import checked_level
+from mpmjax.fitting._fit import Level
 from mpmjax.fitting._problem import Coordinates, FitProblem, linearised
 from mpmjax.fitting._result import FitResult
 from mpmjax.fitting._search import AbstractOptimiser, batch_size, counted, search_many
@@ -26,8 +27,8 @@ def predict(
     of: Callable[[Experiment], Any],
     *,
     experiment: Experiment | int = 0,
-    sigma: Numbers | None = None,
-    level: Scalar | None = None,
+    sigma: Annotated[Numbers, positive] | None = None,
+    level: Level | None = None,
 ) -> Prediction:
     """Anything that follows from the parameters of a fit, with its band.
 
@@ -57,10 +58,9 @@ def predict(
     count = len(result.problem.experiments)
     if isinstance(experiment, int):
         require(0 <= experiment < count, f"The fit has experiments 0 to {count - 1}, got {experiment}.")
-    if sigma is not None:
-        require_positive("predict's sigma", sigma)
-        require(np.size(sigma) > 0, "predict's sigma must be a number or an array of numbers, got an empty one.")
-    level = checked_level(result.level if level is None else level)
+    one = sigma is None or np.size(sigma) > 0
+    require(one, "predict's sigma must be a number or an array of numbers, got an empty one.")
+    level = float(result.level if level is None else level)
     try:
         (value,), (J,) = _linearised(result, eqx.Partial(_of_one, of, experiment))
     except TypeError as error:
@@ -84,7 +84,7 @@ def predict_observations(
     result: FitResult,
     experiments: tuple[Experiment, ...] | list[Experiment] | None = None,
     *,
-    level: Scalar | None = None,
+    level: Level | None = None,
 ) -> tuple[Prediction, ...]:
     """The observations of a fit as it predicts them, with bands, in their order. The noise of a new measurement is that
     which was given or estimated.
@@ -106,14 +106,14 @@ def predict_observations(
         f"predict_observations needs experiments with as many observations as were fitted, {wanted}, got {shape}.",
     )
     observations = [o for e in asked for o in e.observations]
-    level = checked_level(result.level if level is None else level)
+    level = float(result.level if level is None else level)
     same = all(
         e.t1 == f.t1 and eqx.tree_equal(e.observations, f.observations) for e, f in zip(asked, fitted, strict=True)
     )
     if same and all(np.isfinite(o.data).all() for o in observations):
         values, derivatives = result.fitted
     else:
-        asked = tuple(e.with_observations(a.observations, a.t1) for e, a in zip(fitted, asked, strict=True))
+        asked = tuple(replace(e, observations=a.observations, t1=a.t1) for e, a in zip(fitted, asked, strict=True))
         values, derivatives = _linearised(result, eqx.Partial(_observed, asked))
     predictions = []
     each = zip(values, derivatives, observations, result.sigmas, strict=True)
@@ -178,8 +178,8 @@ class Bootstrap(AbstractFit):
 def bootstrap(
     result: FitResult,
     *,
-    repeats: int = 200,
-    seed: int = 0,
+    repeats: Annotated[int, whole(2)] = 200,
+    seed: Annotated[int, whole(0)] = 0,
     batch: int | None = None,
     optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
@@ -203,8 +203,7 @@ def bootstrap(
     Raises:
         ValueError: fewer than two repeats; fewer than two fits that succeeded.
     """
-    require_whole("repeats", repeats, 2)
-    rng = np.random.default_rng(require_whole("seed", seed, 0))
+    rng = np.random.default_rng(seed)
     problem, z = result.problem, jnp.asarray(result.z, result.problem.dtype)
     predicted = [np.asarray(y, float) for e in problem.at(z) for y in e.predictions(e.run())]
     problems = []

@@ -1,15 +1,16 @@
 """Profile likelihoods: intervals that need no straight line."""
 
 from collections.abc import Callable
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Scalar
-from mpmjax.checks import checked, require, require_positive, require_whole, warn
+from mpmjax.checks import checked, positive, require, warn, whole
 from mpmjax.fitting._evaluation import costs_at
-from mpmjax.fitting._fit import checked_level
+from mpmjax.fitting._fit import Level
 from mpmjax.fitting._result import FitResult, intervals
 from mpmjax.fitting._search import AbstractOptimiser, search
 from mpmjax.fitting._uncertainty import quantile
@@ -62,9 +63,9 @@ def profile(
     result: FitResult,
     label: str,
     *,
-    level: Scalar | None = None,
-    points: int = 4,
-    rtol: Scalar = 1e-3,
+    level: Level | None = None,
+    points: Annotated[int, whole(1)] = 4,
+    rtol: Annotated[Scalar, positive] = 1e-3,
     optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Profile:
@@ -100,9 +101,7 @@ def profile(
     """
     problem, sigmas, dtype = result.problem, result.sigmas, result.problem.dtype
     require(label in problem.labels, f"A profile is of a fitted number: {', '.join(problem.labels)}. Got {label!r}.")
-    level = checked_level(result.level if level is None else level)
-    require_whole("profile's points", points, 1)
-    require_positive("profile's rtol", rtol)
+    level = float(result.level if level is None else level)
     at, optimiser = problem.labels.index(label), result.optimiser if optimiser is None else optimiser
     unit, errors = np.eye(problem.size)[at], result.uncertainty
     # By the noise alone √Δχ² is one at a standard error; the threshold is as much farther as the misfit widens that.

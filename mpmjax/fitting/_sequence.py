@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,10 +14,10 @@ import numpy as np
 
 from mpmjax._types import Scalar
 from mpmjax.analysis import sensitivity
-from mpmjax.checks import checked, require, require_positive, warn
+from mpmjax.checks import checked, positive, require, require_positive, warn
 from mpmjax.fitting._estimate import VALUE, AbstractFit, Estimate, NoiseEstimate, table
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._fit import chosen_optimiser, fit, require_end
+from mpmjax.fitting._fit import Level, chosen_optimiser, fit, require_end
 from mpmjax.fitting._observation import Series
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
@@ -35,7 +35,7 @@ def fit_staged(
     horizons: tuple[float, ...] | list[float] | None = None,
     growth: Scalar = 1e3,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
-    level: Scalar = 0.95,
+    level: Level = 0.95,
     optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> FitResult:
@@ -207,10 +207,10 @@ def fit_refined(
     parameters: dict[str, AbstractParameter],
     *,
     refinements: tuple[int, ...] | list[int] = (1, 2),
-    order: Scalar = 1,
+    order: Annotated[Scalar, positive] = 1,
     starts: int | Literal["auto"] | Starts = "auto",
     report: dict[str, Callable[[Experiment], Any]] | None = None,
-    level: Scalar = 0.95,
+    level: Level = 0.95,
     optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
     log: str | os.PathLike | None = None,
@@ -257,7 +257,6 @@ def fit_refined(
         len(numbers) >= 2 and numbers[0] >= 1 and all(a < b for a, b in pairwise(numbers)),
         f"refinements must be two or more growing whole numbers, got {numbers}.",
     )
-    require_positive("order", order)
     fits, start, places = list[FitResult](), parameters, as_starts(starts)
     options: dict[str, Any] = {"report": report, "level": level, "optimiser": optimiser, "progress": progress}
     for n in numbers:
