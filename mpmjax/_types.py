@@ -54,15 +54,13 @@ NodeVector = Float[Array, "n d"]
 ParticleScalar = Float[Array, "p"]
 ParticleVector = Float[Array, "p d"]
 ParticleMatrix = Float[Array, "p d d"]
-Matrix = Float[Array, "d d *p"]
-"""A d x d matrix per particle (or a single one), component first."""
+Matrix = Float[Array, "d d *p"]  # a d x d matrix per particle (or a single one), component first
 
 Deformation = Float[Array, "..."]
 """The deformation that particles store (see `material/_law.py`), component first: F, shape (d, d, *p), or
 J, shape (*p)."""
 
-Compliance = Float[Array, "s s *p"]
-"""The map from the vector of a skew d x d matrix to a spin: s = 3 in 3-D, else 1."""
+Compliance = Float[Array, "s s *p"]  # the map from the vector of a skew d x d matrix to a spin: s = 3 in 3-D, else 1
 
 Indices = Int[Array, "k p"]
 

@@ -27,8 +27,7 @@ from mpmjax.discretisation import Grid, Stencil
 from mpmjax.geometry import length
 from mpmjax.potential import AbstractSpring, Displacement, Forces, Mirror
 
-_SAMPLES = 256
-"""Depths at which the distance of a half-space is tabulated."""
+_SAMPLES = 256  # depths at which the distance of a half-space is tabulated
 STIFFNESS = 2.0
 """α, the stiffness of contact of one body in its wave modulus over a spacing: that of half a spacing of it. A stiffer
 contact makes more of the noise of gaps, some hundredths of a spacing: with 20 the pressure between two cylinders
@@ -36,14 +35,10 @@ differs by a third from node to node."""
 _LEAST_DEPTH = 1e-3
 """Smallest mean depth of the particles around a node, in spacings, at which it counts as near the surface. Deep in a
 body that is zero, in a lattice only rounding."""
-_EMPTY = 1e-9
-"""The part of a cell below which a body is not felt at a node."""
-_LEAST_SPREAD = 1e-2
-"""A variance of this many square spacings is added to that of where two bodies meet."""
-_POWER = 2
-"""How often C⁻¹ is applied for the normal."""
-_SHEET = 2
-"""How many nodes a direction C reaches on either side."""
+_EMPTY = 1e-9  # the part of a cell below which a body is not felt at a node
+_LEAST_SPREAD = 1e-2  # a variance of this many square spacings is added to that of where two bodies meet
+_POWER = 2  # how often C⁻¹ is applied for the normal
+_SHEET = 2  # how many nodes a direction C reaches on either side
 
 
 def half_space(order: int, side: float) -> np.ndarray:

@@ -23,8 +23,7 @@ from mpmjax.boundary._surface_contact import Faces, Surface, surface_contact
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.potential import Image, Mirror, MirrorPlace, Tie, WallImage
 
-ON_THE_WALL = 1e-3
-"""Distance within which a node is on a wall, in spacings."""
+ON_THE_WALL = 1e-3  # distance within which a node is on a wall, in spacings
 
 
 class Wall(NamedTuple):

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.geometry import Motion
 
-PARALLEL = 1e-2
-"""Length of a unit normal's part in free directions up to which it is prescribed by the others."""
+PARALLEL = 1e-2  # length of a unit normal's part in free directions up to which it is prescribed by the others
 
 
 class OwnedImpulse(eqx.Module):

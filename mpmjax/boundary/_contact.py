@@ -34,8 +34,7 @@ from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._conditions import PARALLEL, Conditions, OwnedImpulse
 from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Mirror, WallImage, scattered, with_one_mass
 
-ActiveSet = tuple[Bool[Array, "..."], ...]
-"""The places that are held, one mask for each contact."""
+ActiveSet = tuple[Bool[Array, "..."], ...]  # the places that are held, one mask for each contact
 
 
 class ContactInfo(eqx.Module):

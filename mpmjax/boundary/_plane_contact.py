@@ -12,8 +12,7 @@ from mpmjax.boundary._surface_contact import Faces
 from mpmjax.discretisation import Grid
 from mpmjax.potential import Image, WallImage, wall_image
 
-SHUT = 1e-2
-"""The gap up to which a plane holds what is before it, in spacings."""
+SHUT = 1e-2  # the gap up to which a plane holds what is before it, in spacings
 
 
 FlatWall = tuple[int, Scalar, Array | int]

@@ -18,8 +18,7 @@ from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, Motion
 from mpmjax.potential import Image, MirrorPlace, mirror_image, wall_image
 
-FAR = 0.1
-"""How far behind a contact plane a face is held whatever is beside it, in spacings."""
+FAR = 0.1  # how far behind a contact plane a face is held whatever is beside it, in spacings
 
 
 class AbstractPlane(AbstractBoundary):

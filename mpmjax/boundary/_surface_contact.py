@@ -28,10 +28,8 @@ from mpmjax.potential import AbstractSpring, Displacement, Forces
 EXPLICIT_STIFFNESS = 2.0
 """Stiffness of contact in explicit steps, in the material's wave modulus over a spacing: that of half a spacing of the
 material. More would shorten the longest stable step."""
-IMPLICIT_STIFFNESS = 20.0
-"""Stiffness of contact in implicit steps, in the material's wave modulus over a spacing."""
-SIGNS = (1, -1)
-"""The directions of two surfaces that face each other, along the normal of the first."""
+IMPLICIT_STIFFNESS = 20.0  # stiffness of contact in implicit steps, in the material's wave modulus over a spacing
+SIGNS = (1, -1)  # the directions of two surfaces that face each other, along the normal of the first
 
 
 class FaceShape(eqx.Module):

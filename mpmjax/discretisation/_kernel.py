@@ -9,8 +9,7 @@ import numpy as np
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import require, require_fields
 
-VARIANCE = {2: 1 / 4, 3: 1 / 3}
-"""`BSpline.variance` of each order."""
+VARIANCE = {2: 1 / 4, 3: 1 / 3}  # `BSpline.variance` of each order
 _STEEPEST = {2: 6.0, 3: 3.1368191}
 """The largest value over a cell of dx² Σ_i (∂w_ip)²/w_ip, for the quadratic and the cubic kernel."""
 

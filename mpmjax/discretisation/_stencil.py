@@ -19,8 +19,7 @@ from mpmjax.discretisation._kernel import VARIANCE, AbstractGradient, BSpline, a
 Kind = tuple[int, int]
 """A one-dimensional polynomial for each node: 0 for the weights or 1 for the gradient's factors, and how many times it
 is differentiated."""
-Term = tuple[Kind, ...]
-"""A polynomial along each axis, whose product is one number for each node of a particle."""
+Term = tuple[Kind, ...]  # a polynomial along each axis, whose product is one number for each node of a particle
 
 
 class Basis(NamedTuple):

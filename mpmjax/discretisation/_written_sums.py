@@ -33,8 +33,7 @@ class Factors(NamedTuple):
         return cls(basis.index_terms(first), tuple(along))
 
 
-Pairs = Sequence[tuple[tuple[Term, ...], Array]]
-"""Groups of terms and what particles give to each, (terms, c, p)."""
+Pairs = Sequence[tuple[tuple[Term, ...], Array]]  # groups of terms and what particles give to each, (terms, c, p)
 Given = dict[Term, Float[Array, "p c"]]
 """Amounts that particles give to each term, as rows; of terms without the axes that are done."""
 

@@ -150,8 +150,7 @@ def _correlation(rows: np.ndarray) -> tuple[float, float, float]:
     return float(alike), float(np.clip(of_means, 1, count)), float(np.clip(of_squares, 1, count))
 
 
-IMPROBABLE = 1e-3
-"""Probability, of noise alone, below which a misfit is beyond the noise, or residuals have a shape."""
+IMPROBABLE = 1e-3  # Probability, of noise alone, below which a misfit is beyond the noise, or residuals have a shape
 _LEAST_ROWS = 8  # rows below which nothing is said of their order
 VALUE = f"{{:>12}} ± {'error':<9}"  # head of the first of `Estimate.cells`
 _FIRST_COLUMN = 24

@@ -71,11 +71,9 @@ def fit(
     is not given is estimated: as √(Σ r²/(m − n)) of one observation, and of several so that each explains its own
     misfit, in rounds.
 
-    The misfit is held against the noise, and residuals of each observation, in their order, against independent ones:
-    where there is more than that, other starts are tried (`starts`), the table says what shape residuals have, and
-    errors and intervals hold it, those of the noise alone beside them: by the covariance (JᵀJ)⁻¹ Σ c_k J_kᵀJ_k (JᵀJ)⁻¹
-    with a factor c_k for each observation (docs/fitting.md#intervals-that-hold says how it comes about), and Student's
-    quantile. None of it sees what a parameter can make up for: for that see `discretisation`.
+    Where the misfit is beyond the noise, or residuals have a shape, other starts are tried (`starts`), and errors and
+    intervals hold it, those of the noise alone beside them (docs/fitting.md#intervals-that-hold). None of it sees what
+    a parameter can make up for: for that see `discretisation`.
 
     Ctrl-C ends a fit after the iteration in progress, and it returns the best that it has, not converged.
 

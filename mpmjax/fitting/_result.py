@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import jax
@@ -74,25 +75,13 @@ class FitResult(AbstractFit):
         """The value of each parameter, in its shape."""
         return self.problem.by_name(jnp.asarray(self.z, self.problem.dtype))
 
-    @property
-    def covariance(self) -> np.ndarray:
-        """Covariance of the search's coordinates [-], shape (n, n)."""
-        return self.uncertainty.covariance
-
-    @property
-    def correlation(self) -> np.ndarray:
-        """Correlation of the estimates, shape (n, n)."""
-        return self.uncertainty.correlation
-
-    @property
-    def spectrum(self) -> np.ndarray:
-        """Eigenvalues of the Fisher information JᵀJ, growing, shape (n,): 1/√λ is how far the direction is open."""
-        return self.uncertainty.spectrum
-
-    @property
-    def directions(self) -> np.ndarray:
-        """Eigenvectors of the Fisher information, one a column, shape (n, n)."""
-        return self.uncertainty.directions
+    covariance = property(attrgetter("uncertainty.covariance"), doc="Covariance of the coordinates [-], shape (n, n).")
+    correlation = property(attrgetter("uncertainty.correlation"), doc="Correlation of the estimates, shape (n, n).")
+    spectrum = property(
+        attrgetter("uncertainty.spectrum"),
+        doc="Eigenvalues of the Fisher information JᵀJ, growing, shape (n,): 1/√λ is how far the direction is open.",
+    )
+    directions = property(attrgetter("uncertainty.directions"), doc="Their eigenvectors, one a column, shape (n, n).")
 
     @property
     def all(self) -> tuple[Estimate, ...]:

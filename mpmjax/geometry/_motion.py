@@ -250,10 +250,8 @@ class TimeSeries(eqx.Module):
         return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.values))
 
 
-Changing = Scalar | TimeSeries
-"""A number, constant or as a time series."""
-ChangingVector = Point | TimeSeries
-"""A vector of d numbers, likewise."""
+Changing = Scalar | TimeSeries  # a number, constant or as a time series
+ChangingVector = Point | TimeSeries  # a vector of d numbers, likewise
 
 
 def value_at(value: Changing | ChangingVector, t: Scalar) -> Float[Array, "..."]:

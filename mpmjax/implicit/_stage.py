@@ -38,8 +38,7 @@ class Guess(enum.Enum):
     """v^n, the velocity of the nodes before the step. The default."""
     EXPLICIT = "explicit"
     """v*, the explicitly updated velocity (derivation, eq. 4)."""
-    ZERO = "zero"
-    """Zero velocity."""
+    ZERO = "zero"  # zero velocity
 
 
 class StageProblem(eqx.Module):

@@ -43,8 +43,7 @@ from mpmjax.simulation import (
 )
 from mpmjax.state import with_state
 
-FIELDS_WRITTEN = ("pressure", "von_mises", "material")
-"""The fields that a file has unless it is asked for others."""
+FIELDS_WRITTEN = ("pressure", "von_mises", "material")  # the fields that a file has unless it is asked for others
 
 _IMPULSES = ("collider_impulse", "boundary_impulse")
 

@@ -30,16 +30,13 @@ from mpmjax.autodiff import custom_derivative, is_unknown
 from mpmjax.linalg._decompositions import symmetric_eigen
 from mpmjax.linalg._matrices import matmul, transpose
 
-Frame = tuple[Array, Matrix]
-"""Eigenvalues and eigenvectors, (d, *batch) and (d, d, *batch)."""
+Frame = tuple[Array, Matrix]  # eigenvalues and eigenvectors, (d, *batch) and (d, d, *batch)
 
 _CLOSE = 0.01
 """Relative to the sum of the outer two: the divided difference of three or more eigenvalues closer than this is a
 series. Elsewhere it is a quotient of differences, with an error of rounding over this."""
-_SMALL, _LAST = 0.3, 14
-"""Where the exponential is a series, and its last power: the remainder is below 1e-16 of it."""
-_TERMS = 6
-"""Terms of the series after the first; the remainder is of the order 1e-12."""
+_SMALL, _LAST = 0.3, 14  # where the exponential is a series, and its last power: the remainder is below 1e-16 of it
+_TERMS = 6  # terms of the series after the first; the remainder is of the order 1e-12
 
 
 class AbstractSpectral(eqx.Module):

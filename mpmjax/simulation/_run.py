@@ -19,18 +19,13 @@ class Fault(enum.IntEnum):
     """A fault of a state or a step. A member may be compared with a traced whole number."""
 
     NONE = 0
-    NOT_FINITE = 1
-    """A number of a particle is infinite or NaN."""
-    OUTSIDE = 2
-    """A particle's stencil has left the grid's window."""
-    INADMISSIBLE = 3
-    """A law does not allow a particle's deformation gradient."""
-    PASSED = 4
-    """A particle has passed a boundary that keeps it out."""
+    NOT_FINITE = 1  # a number of a particle is infinite or NaN
+    OUTSIDE = 2  # a particle's stencil has left the grid's window
+    INADMISSIBLE = 3  # a law does not allow a particle's deformation gradient
+    PASSED = 4  # a particle has passed a boundary that keeps it out
     BAD_PARAMETERS = 5
     """Scene, particles or method have a value that their module does not allow, which a jax transformation hid."""
-    COLLAPSED = 6
-    """A particle has collapsed: a stretch of it is below a hundredth."""
+    COLLAPSED = 6  # a particle has collapsed: a stretch of it is below a hundredth
 
 
 class RunStatistics(eqx.Module):

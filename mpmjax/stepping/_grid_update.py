@@ -15,8 +15,7 @@ from mpmjax.stepping._implicit_integrators import AbstractImplicitIntegrator
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
 
-SWEEPS = 4
-"""Most active sets that are tried in a step."""
+SWEEPS = 4  # most active sets that are tried in a step
 
 
 class GridUpdate(eqx.Module):

@@ -20,10 +20,8 @@ from mpmjax.stepping._contact_surfaces import contact_moduli
 from mpmjax.stepping._integrator import AbstractIntegrator, Explicit
 from mpmjax.stepping._nodes import start_nodes
 
-MOST_STEPS = 2**31 - 1
-"""The largest number of steps of a run."""
-SAFETY = 0.7
-"""The default safety."""
+MOST_STEPS = 2**31 - 1  # the largest number of steps of a run
+SAFETY = 0.7  # the default safety
 
 
 class UnknownBoundError(ValueError):

@@ -103,8 +103,7 @@ def step_unchecked(
     )
 
 
-step_compiled = eqx.filter_jit(step_unchecked)
-"""`step_unchecked`, compiled as one program."""
+step_compiled = eqx.filter_jit(step_unchecked)  # `step_unchecked`, compiled as one program
 
 
 def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:

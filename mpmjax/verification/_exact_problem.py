@@ -30,12 +30,9 @@ _SAMPLES = 10
 class Ends(enum.Enum):
     """The boundary of a problem whose exact motion is odd at the faces of its box."""
 
-    PERIODIC = "periodic"
-    """No wall; twice the box is a period."""
-    MIRRORED = "mirrored"
-    """Symmetry planes."""
-    PLAIN = "plain"
-    """Slip walls: the normal velocity of the nodes at and beyond them is zero."""
+    PERIODIC = "periodic"  # no wall; twice the box is a period
+    MIRRORED = "mirrored"  # symmetry planes
+    PLAIN = "plain"  # slip walls: the normal velocity of the nodes at and beyond them is zero
 
 
 class AbstractProblem(eqx.Module):
@@ -48,8 +45,7 @@ class AbstractProblem(eqx.Module):
     material: eqx.AbstractVar[AbstractMaterial]
     density: eqx.AbstractVar[float]
     dim: eqx.AbstractVar[int]
-    forced: ClassVar[bool] = True
-    """Whether the motion needs the body force."""
+    forced: ClassVar[bool] = True  # whether the motion needs the body force
 
     @abc.abstractmethod
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:

@@ -4,13 +4,13 @@ import shutil
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax.analysis import FIELDS, smoothed, volume_ratio
-from mpmjax.checks import canonical, checked, require, require_between, require_memory
+from mpmjax.checks import between, canonical, checked, require, require_between, require_memory
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene, by_material, history_arrays
@@ -40,8 +40,8 @@ def render(
     colour: str | None = "speed",
     frame: int | None = None,
     view: tuple[float, float] = (30.0, 20.0),
-    fps: int = 20,
-    dpi: float = 120.0,
+    fps: Annotated[int, between(1, 100)] = 20,  # a GIF counts hundredths of a second
+    dpi: Annotated[float, between(1, 6000)] = 120.0,  # matplotlib draws fewer than 2^16 pixels a side
 ) -> None:
     """Draw a run: one frame as a still (.png, .pdf, .svg) or all of them as a film (.gif, or .mp4 where ffmpeg is).
 
@@ -89,8 +89,6 @@ def render(
     require(frame is None or still, f"frame is for a still; a {path.suffix} shows all frames.")
     can_be = path.suffix != ".mp4" or shutil.which("ffmpeg")
     require(can_be, "A .mp4 needs the program ffmpeg, which is not there: install it, or write a .gif.")
-    require_between("fps", fps, 1, 100)  # a GIF counts hundredths of a second
-    require_between("dpi", dpi, 1, 6000)  # matplotlib draws fewer than 2^16 pixels a side
     require_memory(f"A picture of {dpi:g} dots an inch", 64 * 8 * 6 * dpi**2, "take a smaller dpi.")
     require_between("view's azimuth [degrees]", view[0], -360, 360)
     require_between("view's elevation [degrees]", view[1], 0.1, 90)
