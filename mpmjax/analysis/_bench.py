@@ -97,8 +97,7 @@ class Clock:
         return self._end - time.perf_counter()
 
     def allows(self, seconds: float) -> bool:
-        """Whether a run of compiled code that takes these seconds is allowed: it fits into the seconds left, or into a
-        twentieth of all."""
+        """Whether compiled code may run for so long: it fits into the seconds left, or into a twentieth of all."""
         return seconds <= max(self.left, self.seconds / 20)
 
 
@@ -185,8 +184,7 @@ def settle(
     )
 
     def refined(bench: Bench, steps: int) -> tuple[Trial, list[State] | None, Displacements | None]:
-        """A run, its error the change from the motion of the run before; its states and its motion, None if it
-        failed."""
+        """A run, its error the change from the motion of the run before; its states and motion, None if it failed."""
         states, _, seconds = bench.run(method, steps)
         motion = None if states is None else bench.motion(states)
         change = math.inf if motion is None or coarse is None else coarse.distance(motion)

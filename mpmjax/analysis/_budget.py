@@ -1,5 +1,4 @@
-"""Mass, momentum and energy of a state, and their budgets for each step, with a term for every transfer, force and
-approximation."""
+"""Mass, momentum and energy of a state, and their budgets by transfer, force and approximation in each step."""
 
 import equinox as eqx
 import jax

@@ -159,8 +159,7 @@ def _bytes(size: int | float) -> str:
 
 
 def _summary(start: Particles, run: Run, taken: int = 0, seconds: float = 0.0) -> str:
-    """The cost of a run from its first particles on, if `taken` of its steps were done in these seconds, and how well
-    it kept mass and energy."""
+    """The cost of `taken` steps of a run in these seconds, if any, and how well it kept mass and energy."""
     s, p, steps = run.statistics, run.final.count, max(int(run.statistics.steps), 1)
     before, after = energy(run.scene, start), energy(run.scene, run.final)
     whole, parts = pieces(run.scene, start), pieces(run.scene, run.final)
@@ -270,8 +269,7 @@ def fit_scene(
 
 
 def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> FitFile:
-    """The fit, started where a fit to growing horizons ended, if the file asks for these, to the data that they
-    reach."""
+    """The fit, started where a fit to growing horizons ended if the file asks for these, to the data they reach."""
     if not asked.horizons:
         return asked
     times = None if asked.horizons is True else asked.horizons

@@ -1,5 +1,4 @@
-"""The `[fit]` table of a scene file: what is fitted, and what was measured. `docs/scene_files.md` is the schema in
-words."""
+"""The `[fit]` table of a scene file (docs/scene_files.md): what is fitted, and what was measured."""
 
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass

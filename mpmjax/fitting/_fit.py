@@ -216,8 +216,7 @@ def _in_rounds(
 
 
 def require_end(end: Search) -> None:
-    """Raise a `KeyboardInterrupt` if a search was interrupted, a `RuntimeError` if it failed for want of a
-    derivative."""
+    """Raise a `KeyboardInterrupt` of an interrupted search, a `RuntimeError` of one without a derivative."""
     if end.interrupted:
         raise KeyboardInterrupt
     if end.failure == NO_DERIVATIVE:

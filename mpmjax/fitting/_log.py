@@ -287,8 +287,7 @@ def _lines(
 
 
 def iterations_left(distances: list[float]) -> int | None:
-    """How many iterations the distance needs to fall to one, at the mean rate of its last three values; None where it
-    does not fall, or is not known."""
+    """Iterations until the distance is one, at the mean rate of the last three; None where it does not fall."""
     last = np.asarray(distances[-3:])
     if len(last) < 3 or not (np.isfinite(last).all() and 0 < last[-1] < last[0]):
         return None

@@ -24,8 +24,7 @@ class Uncertainty(NamedTuple):
     """The covariance of n coordinates at a minimum, by the Gauss-Newton Hessian."""
 
     inverse: np.ndarray
-    """The covariance, but in directions that the data do not see, shape (n, n); of noise alone the pseudo-inverse of
-    JᵀJ."""
+    """The covariance [-] but in directions that the data do not see, shape (n, n); of noise alone (JᵀJ)⁺."""
     unseen: np.ndarray  # directions that the data do not see, one a column, shape (n, u)
     weak: np.ndarray
     """Directions that the data hardly see, a tenth as well as each coordinate alone, one a column, shape (n, w)."""

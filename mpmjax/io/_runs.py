@@ -222,8 +222,7 @@ def save(path: str | os.PathLike, run: Run, *, fields: tuple[str, ...] | list[st
 
 
 def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
-    """Check that the step is positive, step numbers grow, states are finite, and positions are ones that a grid can
-    number."""
+    """Check that dt is positive, step numbers grow, states are finite, and a grid can number the positions."""
     require_positive("dt [s]", dt)
     require(steps[0] >= 0 and (np.diff(steps) > 0).all(), f"A run's steps must grow from 0 or later, got {steps}.")
     most = float(scene.grid.spacing) * 2**31  # as far as nodes are numbered

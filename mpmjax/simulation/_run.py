@@ -51,8 +51,7 @@ class RunStatistics(eqx.Module):
     fault: Int[Array, "*f"]  # the first `Fault`
     fault_step: Int[Array, "*f"]  # number of steps that led to it
     unmet: Int[Array, "*f"]
-    """With BAD_PARAMETERS the number, from one, of the first of the `requirements` on scene, particles and method that
-    is not met; else zero."""
+    """With BAD_PARAMETERS the number, from one, of the first of the `requirements` that is not met; else zero."""
 
     @property
     def linearisation_error(self) -> Float[Array, "*f"]:
@@ -121,8 +120,7 @@ class SimulationError(RuntimeError):
 
 
 class Forces(NamedTuple):
-    """Mean forces and torques on k colliders or boundaries over the steps between one saved frame and the next, of f
-    frames."""
+    """Mean forces and torques on k colliders or boundaries between one saved frame and the next, of f frames."""
 
     times: Float[Array, "g"]
     """The mean of the times of the steps' forces [s], shape (f − 1,): t_n + θΔt, with θ the method's `force_at`. It is

@@ -210,8 +210,7 @@ def _rollout(problem: Problem, steps: int) -> Particles:
 
 
 def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
-    """How many steps of dt lead from step `start` to time t1; a ValueError if that is no whole number, none, or more
-    than the precision can count."""
+    """Steps of dt from step `start` to time t1; a ValueError if no whole number, none, or too many for the dtype."""
     if is_traced((t1, dt)):
         raise ValueError("t1 and dt fix the number of steps and must be known numbers, not traced ones.")
     require_positive("dt [s]", dt, dtype)
