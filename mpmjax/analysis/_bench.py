@@ -4,8 +4,7 @@ The reference is refined until it changes little or its time is up. If explicit 
 `stable_dt` of the whole motion, which resolves all that the grid does. Otherwise it uses TR-BDF2, and halves the step
 until that changes the motion by less than a third of the target error, or until the step is below the explicit limit.
 Then spacing and step are halved together: transfers act once a step, so on a given grid a smaller step alone need not
-improve the motion. The last change estimates the error of the reference run; the estimate is safe for convergence of
-first order or more.
+improve the motion. The last change estimates the error of the reference run, safely from the first order on.
 """
 
 import math

@@ -163,8 +163,7 @@ class MomentumBudget(eqx.Module):
 
     change = gravity + body_force + boundary + friction + elastic + viscous + transfer.
 
-    The impulse of a symmetry plane is that of its mirror image, in `elastic` and `transfer`. Without such planes both
-    vanish.
+    The impulse of a symmetry plane is that of its mirror image, in `elastic` and `transfer`, which else vanish.
     """
 
     change: Float[Array, "*f d"]  # change of Σ m v

@@ -233,9 +233,8 @@ def canonical(tree: Any, dtype: Any) -> Any:
 
 
 def require_memory(what: str, needed: float | int, advice: str, *, device: bool = False) -> None:
-    """Raise a `ValueError` if what will be allocated, `needed` bytes at least, of jax's `device` or the host, does
-    not fit into the available memory. `what` is the subject of "takes at least so many GB", `advice` says which
-    number to change."""
+    """Raise a `ValueError` if `needed` bytes are more than the available memory of jax's `device` or the host. `what`
+    is the subject of "takes at least so many GB", `advice` says which number to change."""
     if needed < 2**26:  # asking takes longer
         return
     there = available_memory(device=device)

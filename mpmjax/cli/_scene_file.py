@@ -93,8 +93,7 @@ def load_scene(path: str | os.PathLike) -> tuple[Scene, Particles, dict[str, Any
     that on. "stable" and "auto" are resolved as there, the latter by pilot runs.
 
     Raises:
-        ValueError: a file that is missing or not TOML; a key that is unknown, missing or unfit: one line with its
-            place.
+        ValueError: a file that is missing or not TOML; an unknown, missing or unfit key: one line with its place.
     """
     simulation = read_simulation(Path(path))
     return simulation.scene, simulation.particles, simulation.settings

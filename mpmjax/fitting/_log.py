@@ -1,8 +1,7 @@
 """The record of a fit while it runs: lines of progress, and a log from which it continues bit for bit.
 
 The log is an HDF5 file, whose layout is in docs/fitting.md. It is replaced as a whole after each iteration (see
-`mpmjax.io.ReplacedFile`): it holds whole iterations only, however the process ends. Its last four bytes are CRC-32 of
-all others.
+`mpmjax.io.ReplacedFile`): it holds whole iterations only, however the process ends. Its last four bytes are its CRC-32.
 """
 
 import enum

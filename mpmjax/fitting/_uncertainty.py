@@ -8,8 +8,7 @@ import numpy as np
 from mpmjax.checks import warn
 
 _ROUNDINGS = 1e3
-"""Singular values of J, its columns of length one, below this many roundings of the largest are none: the data do not
-see the direction."""
+"""Singular values of J, its columns of length one, below so many roundings of the largest are of unseen directions."""
 _SHARE = 1e-6  # part of a unit vector below which it does not lie in a direction
 _LEAST_FREEDOM = 1e-3  # degrees of freedom below which there are none, but rounding
 _AT_BOUND = 1e-2  # standard errors from a bound at which a number lies at it

@@ -96,8 +96,7 @@ def record(
     """Simulate as `simulate` does, writing each frame to a file when it is reached; memory holds one frame only.
 
     The steps between two frames are one compiled program, called again and again, and give the same numbers as
-    `simulate` with the same `save_every`, bit for bit on a CPU. A run that is interrupted or meets a fault leaves a
-    whole file.
+    `simulate` with the same `save_every`, bit for bit on a CPU. An interruption or a fault leaves a whole file.
 
     Args:
         path: the file to be (see `save`).
@@ -245,8 +244,7 @@ def load(path: str | os.PathLike, *, frame: int | None = None) -> Run:
 
     Args:
         path: the file.
-        frame: number of the only frame to read, which the run then ends with; counts from the end if negative.
-            Default: all.
+        frame: number of the only frame to read, from the end if negative, with which the run ends. Default: all.
 
     Raises:
         ValueError: a frame that is not there; a file that is missing, cut short or damaged, not of this package or of

@@ -3,8 +3,7 @@
 `replacing` writes a new file aside and puts it in its place. A `StagedFile` changes by commits: all of what was written
 since the last one, or nothing; and one writer at a time. HDF5 writes as it sees fit, also while it closes, and what a
 full disk refuses then is lost in silence. So it writes to memory, and a commit puts that on the disk: what lengthens
-the file first, since this is where room runs out, then what lies within it. If the disk refuses, the file is made what
-it was.
+the file first, since this is where room runs out, then what lies within it. If the disk refuses, it is made as it was.
 
 On Ctrl-C and SIGTERM a command of the shell ends at once, between two writes, and says where its files stand. Python's
 own way is an exception in the main thread, which waits until compiled code returns, and then comes anywhere: amid a
