@@ -19,16 +19,7 @@ from mpmjax.analysis import METHODS, Trial, energy, grid_mass, name_of, pieces, 
 from mpmjax.checks import require, warn
 from mpmjax.cli._fit_file import FitFile, read_fit, refinements
 from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
-from mpmjax.fitting import (
-    Experiment,
-    FitProblem,
-    Profile,
-    fit,
-    fit_refined,
-    fit_staged,
-    predict_observations,
-    profile,
-)
+from mpmjax.fitting import Experiment, FitProblem, Profile, fit, fit_refined, fit_staged, predict_observations, profile
 from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, replacing, reporting, standing_in, stopping, table
 from mpmjax.native import BACKENDS, backend
 from mpmjax.simulation import Problem, Run, SimulationError, initial_state, no_steps, run_to

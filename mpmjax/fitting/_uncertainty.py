@@ -230,12 +230,7 @@ class Prediction(NamedTuple):
 
 
 def banded(
-    errors: Uncertainty,
-    level: float,
-    value: Any,
-    J: Any,
-    sigma: np.ndarray | None = None,
-    number: int | None = None,
+    errors: Uncertainty, level: float, value: Any, J: Any, sigma: np.ndarray | None = None, number: int | None = None
 ) -> Prediction:
     """Values with their bands, by their derivative J, shape (..., n). `sigma` is the noise of new measurements, if that
     is known, `number` that of their observation, if they are of one."""

@@ -34,13 +34,7 @@ from mpmjax.io._run_file import (
     states_in,
 )
 from mpmjax.io._transactional_file import StagedFile, reason, replacing, undisturbed
-from mpmjax.simulation import (
-    Problem,
-    RolloutState,
-    RunStatistics,
-    initial_state,
-    no_steps,
-)
+from mpmjax.simulation import Problem, RolloutState, RunStatistics, initial_state, no_steps
 from mpmjax.state import with_state
 
 FIELDS_WRITTEN = ("pressure", "von_mises", "material")  # the fields that a file has unless it is asked for others

@@ -45,13 +45,7 @@ from mpmjax.checks import (
     warn,
 )
 from mpmjax.io._frame_writer import FIELDS_WRITTEN, FrameWriter, at, check_fields, frames_in, new_writer
-from mpmjax.io._run_file import (
-    check_place,
-    count_in,
-    description_in,
-    reading,
-    require_of_file,
-)
+from mpmjax.io._run_file import check_place, count_in, description_in, reading, require_of_file
 from mpmjax.io._schema import decode
 from mpmjax.io._transactional_file import reporting
 from mpmjax.simulation import (
