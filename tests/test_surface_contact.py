@@ -398,6 +398,8 @@ def test_a_wall_that_holds_a_fluid_keeps_a_velocity_that_is_linear_across_it(met
         ("fluid", "slip", 2, 0.1, 9.0),
         ("fluid", "sticky", 2, 0.0, 0.7),
         *thorough(("fluid", "slip colliders", 2, 0.1, 9.0), ("fluid", "sticky colliders", 2, 0.25, 0.7)),
+        *thorough(*((law, "colliders", 2, 0.1, 9.0) for law in ("viscous_fluid", "herschel_bulkley"))),
+        *thorough(("fluid", "colliders", 2, 0.25, 0.7), ("fluid", "colliders", 3, 0.1, 9.0)),
         *thorough(*(("fluid", kind, 2, at, 0.7) for kind in ("slip", "sticky") for at in (0.0, 0.1, 0.25, 0.5))),
         *thorough(*((law, "slip", 2, 0.1, 9.0) for law in ("viscous_fluid", "herschel_bulkley"))),
         *thorough(("fluid", "slip", 3, 0.1, 9.0), ("viscous_fluid", "sticky", 2, 0.25, 9.0)),
@@ -531,6 +533,12 @@ def test_walls_that_hold_a_fluid_beside_a_solid_feel_all_that_they_take(method, 
     speed = beside_a_solid(kind, method, first=False)
     difference = (speed(1 + 1e-4)[0] - speed(1 - 1e-4)[0]) / 2e-4
     assert_close(speed(1.0)[1], difference, 1e-5)
+
+
+@pytest.mark.thorough
+def test_colliders_that_a_fluid_may_leave_feel_all_that_they_take():
+    """So are those of half-spaces across axes, whose contacts take long to compile."""
+    test_walls_that_hold_a_fluid_beside_a_solid_feel_all_that_they_take(METHODS["explicit"], "colliders")
 
 
 @pytest.mark.parametrize("kind", ["sticky", *thorough("slip")])
