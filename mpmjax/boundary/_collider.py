@@ -25,6 +25,7 @@ from mpmjax.checks import canonical, require, require_between, require_fields
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, length, still
 
+_ASKEW = 1e-6  # the slope to an axis up to which a half-space is across it: a turned one is so to rounding
 _LOOKS = 4  # places of a particle's way in which a collider is looked for
 
 
@@ -108,31 +109,37 @@ class AbstractCollider(AbstractBoundary):
         )
         return conditions, place, motion.velocity_of(place, t, dt)
 
-    def across_axes(self) -> tuple[FlatWall, ...]:
-        """The planes of a half-space that rests, one across each axis, infinitely far where the normal is not along it;
+    def across_axes(self, t: Scalar) -> tuple[FlatWall, ...]:
+        """The planes of a half-space at time t, one across each axis, infinitely far where the normal is not along it;
         none of other bodies."""
-        if self.motion is not None or not isinstance(self.shape, HalfSpace):
+        if not isinstance(self.shape, HalfSpace):
             return ()
         point, normal = jnp.asarray(self.shape.point), jnp.asarray(self.shape.normal)
-        inward, along = jnp.where(normal < 0, -1, 1), (normal != 0) & ((normal != 0).sum() == 1)
+        if self.motion is not None:
+            point, normal = self.motion.place(point[None], t)[0], self.motion.turned(normal[None], t)[0]
+        size = jnp.abs(normal)
+        inward, along = jnp.where(normal < 0, -1, 1), size.sum() - size <= _ASKEW * size
         places = jnp.where(along, point, jnp.where(normal < 0, jnp.inf, -jnp.inf))
         return tuple((axis, places[axis], inward[axis]) for axis in range(self.dim))
 
+    def wall_velocity(self, nodes: NodeVector, t: Scalar, dt: Scalar) -> NodeVector | None:
+        return None if self.motion is None else self.motion.velocity_of(self.motion.origin(nodes, t), t, dt)
+
 
 class AbstractHoldingCollider(AbstractCollider):
-    """A body from which material cannot part. It holds the nodes in it; what flows a half-space across an axis that
-    rests holds by columns of nodes as a box does, so that it stays at rest: its motion has no derivative by the
-    half-space's place and normal."""
+    """A body from which material cannot part. It holds the nodes in it; what flows a half-space across an axis holds by
+    columns of nodes as a box does, so that it stays at rest: its motion has no derivative by the half-space's place and
+    normal."""
 
     meets_constraints: ClassVar[bool] = False
 
-    def planes(self) -> tuple[FlatWall, ...]:
-        return self.across_axes()
+    def planes(self, t: Scalar) -> tuple[FlatWall, ...]:
+        return self.across_axes(t)
 
 
 class StickyCollider(AbstractHoldingCollider):
     """A body to which the material sticks: nodes in it have its velocity, exactly, also after a solve. Fluids stay at
-    rest at a half-space across an axis that rests.
+    rest at a half-space across an axis.
 
     In the total description it holds the reference nodes that lie in it before its motion: a grip that can turn.
 
@@ -155,7 +162,7 @@ class StickyCollider(AbstractHoldingCollider):
 
 class SlipCollider(AbstractHoldingCollider):
     """A body along which the material slides freely and from which it cannot part: nodes in it have its velocity along
-    the normal, exactly, also after a solve. Fluids stay at rest at a half-space across an axis that rests.
+    the normal, exactly, also after a solve. Fluids stay at rest at a half-space across an axis.
 
     In the total description only a half-space without rotation: elsewhere the normal of a reference node changes as it
     slides.
@@ -197,9 +204,9 @@ class SeparatingCollider(AbstractCollider):
 
     It has derivatives by its place and size, and those of its motion.
 
-    A fluid is held at a half-space across an axis that rests as by a `SeparatingBox`, so that it stays at rest.
+    A fluid is held at a half-space across an axis as by a `SeparatingBox`, so that it stays at rest.
 
-    *When it breaks*: as a `SeparatingBox`. Fluids do not come to rest at other shapes and where it moves. A body or
+    *When it breaks*: as a `SeparatingBox`. Fluids do not come to rest at other shapes. A body or
     part of it that is thinner than two spacings does not keep material out, and one that moves through more than a
     spacing in a step leaves some behind. Not in the total description.
 
@@ -240,14 +247,17 @@ class SeparatingCollider(AbstractCollider):
     ) -> tuple[AbstractContact, ...]:
         """Springs, and for what flows at a half-space a plane across each axis, as of a `SeparatingBox`."""
         assert faces is not None  # as it `pushes`
-        (surface,), planes = self.surfaces(faces.x, t, dt, faces.push_time), self.across_axes()
+        (surface,), planes = self.surfaces(faces.x, t, dt, faces.push_time), self.across_axes(t)
         springs = surface_contact(surface, faces)
         if not planes or not faces.flowing.any():
             return (springs,)
         along = jnp.isfinite(jnp.stack([position for _, position, _ in planes]))
-        shut = faces.flowing & (springs.gap <= SHUT * faces.spacing)
+        gap = springs.gap  # at the start, of a wall that moves too
+        if self.motion is not None:
+            gap = surface_contact(self.surfaces(faces.x, t, dt, t)[0], faces).gap
+        shut = faces.flowing & (gap <= SHUT * faces.spacing)
         around = scatter(faces.stencil, (along[:, None] & shut).astype(faces.x.dtype), None, grid.size)
-        walls = wall_images(planes, faces, grid, window)
+        walls = wall_images(planes, faces, grid, window, velocity=self.wall_velocity(grid.nodes(window), t, dt))
         each = enumerate(zip(walls, planes, strict=True))
         held = [plane_contact((wall,), (plane[2],), self.friction, around[:, k : k + 1]) for k, (wall, plane) in each]
         # an explicit step's springs push no face before the surface
