@@ -26,15 +26,17 @@ INF = np.inf
 WATER, G = 1e3, 10.0
 
 
-def walls_of(kind: str, lower: float, upper: float) -> tuple[mpm.boundary.AbstractBoundary, ...]:
-    """A vessel that is open above."""
+def walls_of(
+    kind: str, lower: float, upper: float, motion: mpm.Motion | None = None
+) -> tuple[mpm.boundary.AbstractBoundary, ...]:
+    """A vessel that is open above; planes and a `SeparatingBox` do not move."""
     wall: Any = getattr(mpm, kind)
     if kind.endswith("Box"):
-        return (wall((lower, lower), (upper, INF)),)
+        return (wall((lower, lower), (upper, INF), **({"motion": motion} if motion else {})),)
     if kind.endswith("Plane"):
         return wall(0, lower), wall(0, upper, keep="below"), wall(1, lower)
     sides = ((lower, 0.0), (1.0, 0.0)), ((upper, 0.0), (-1.0, 0.0)), ((0.0, lower), (0.0, 1.0))
-    return tuple(wall(mpm.HalfSpace(point, normal)) for point, normal in sides)
+    return tuple(wall(mpm.HalfSpace(point, normal), motion) for point, normal in sides)
 
 
 def pressure(law: mpm.material.AbstractLaw, F: jax.Array, history: object) -> jax.Array:
@@ -61,14 +63,25 @@ def squeezed(law: mpm.material.AbstractLaw, wanted: np.ndarray) -> tuple[jax.Arr
     return at(high)
 
 
-def settled(law: mpm.material.AbstractLaw, kind: str, at: float, times: float, seconds: float, cells: int = 8) -> str:
+def settled(
+    law: mpm.material.AbstractLaw,
+    kind: str,
+    at: float,
+    times: float,
+    seconds: float,
+    cells: int = 8,
+    crossed: float = 0.0,
+) -> str:
     """A vessel that starts in its exact state, so many cells wide and half as deep, with walls at so many spacings from
-    a node, in steps of so many times the explicit limit."""
+    a node, in steps of so many times the explicit limit; it moves sideways by so many spacings."""
     dx, wide, deep, low = 1 / 16, cells / 16, cells / 32, at / 16
     load = WATER * G * deep
     grid = mpm.Grid((cells + 10, cells + 12), dx, origin=(-4, -4))
     water = mpm.fill(mpm.Box((low, low), (low + wide, low + deep)), grid, density=WATER)
-    scene = mpm.Scene(grid, law, gravity=(0.0, -G), boundary=walls_of(kind, low, low + wide))
+    way = (crossed * dx, 0.0)
+    motion = mpm.Motion((0.0, seconds), ((0.0, 0.0), way)) if crossed else None
+    water = dataclasses.replace(water, v=water.v + jnp.asarray(way) / seconds)
+    scene = mpm.Scene(grid, law, gravity=(0.0, -G), boundary=walls_of(kind, low, low + wide, motion))
     F, history = squeezed(law, np.asarray(WATER * G * (deep + low - water.x[:, 1])))
     volume = water.volume / law.measure.determinant(F)
     stored = jnp.moveaxis(F, -1, 0)
@@ -113,6 +126,9 @@ def walls() -> None:
     for law in (mpm.Fluid(K), mpm.Viscous(mpm.Fluid(K), 10.0), mpm.HerschelBulkley(E, 0.45, load / 100, 10.0)):
         for kind, times in ((kind, times) for kind in (*boxes, *colliders, *others) for times in (0.7, 9.0)):
             print(f"{type(law).__name__:>16} {kind:>18}", settled(law, kind, 0.0, times, 1.0), flush=True)
+    print("a fluid in a vessel that moves sideways by two spacings")
+    for kind, times in ((kind, times) for kind in ("SlipBox", "StickyCollider", colliders[1]) for times in (0.7, 9.0)):
+        print(f"{kind:>35}", settled(mpm.Fluid(K), kind, 0.1, times, 1.0, crossed=2.0), flush=True)
     for law in (mpm.DruckerPrager(E, 0.45, 0.5), mpm.CamClay(E, 0.45, 1.0, 2 * load), mpm.Snow(E, 0.45)):
         for kind in boxes:
             print(f"{type(law).__name__:>16} {kind:>18}", settled(law, kind, 0.0, 9.0, 1.0), flush=True)

@@ -189,30 +189,6 @@ def test_a_run_that_ends_with_water_in_its_lowest_layer_tells_of_it():
         mpm.simulate(scene, fallen, t1=1e-4, dt=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("boundary", "told"),
-    [
-        (mpm.SlipBox((0.0, 0.04), (np.inf, np.inf)), None),
-        (mpm.StickyBox((-np.inf, 0.04), (np.inf, np.inf)), None),
-        (mpm.StickyCollider(mpm.HalfSpace((0.0, 0.04), (0.0, 2.0))), None),
-        (mpm.SeparatingCollider(mpm.HalfSpace((0.0, -0.05), (0.0, 1.0))), "SeparatingCollider .* stirs it"),
-        (mpm.SlipBox((-0.2, 0.0), (0.8, np.inf)), None),
-        (mpm.SeparatingBox((-np.inf, -0.04), (np.inf, np.inf)), None),
-        (mpm.SeparatingCollider(mpm.HalfSpace((0.0, -0.05), (0.1, 1.0))), None),
-        (mpm.SymmetryPlane(1, -0.05), None),
-    ],
-)
-def test_a_wall_at_which_a_fluid_finds_no_rest_is_told_of(boundary, told):
-    """Not where no better one would do, nor of solids."""
-    for law, expected in ((mpm.Fluid(1e4), told), (LAWS["neo_hookean"], None)):
-        scene, particles = block(2, material=law, boundary=boundary)
-        particles = eqx.tree_at(lambda p: p.x, particles, particles.x.at[:, 1].add(0.05))
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            mpm.prepare(scene, particles)
-        assert [bool(re.search(expected or "^$", str(w.message))) for w in said] == [True] * (expected is not None)
-
-
 def test_a_tolerance_that_anything_meets_is_told_of():
     for make in (mpm.implicit.ConjugateResidual, lambda rtol: mpm.implicit.Newton(rtol=rtol)):
         with pytest.warns(UserWarning, match=r"rtol is 10\.0: at 1 or more the zero vector already meets it"):

@@ -99,13 +99,22 @@ class AbstractBoundary(eqx.Module):
             return ()
         return tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
 
-    def planes(self) -> tuple[FlatWall, ...]:
-        """The planes across an axis that what flows never leaves. Default: none."""
+    def planes(self, t: Scalar) -> tuple[FlatWall, ...]:
+        """The planes across an axis at time t that what flows never leaves. Default: none."""
+        del t
         return ()
 
-    def fluid_walls(self, faces: Faces, grid: Grid, window: Int[Array, "d"]) -> tuple[WallImage, ...]:
+    def wall_velocity(self, nodes: NodeVector, t: Scalar, dt: Scalar) -> NodeVector | None:
+        """Their velocity from t to t + dt at the nodes [m/s], shape (n, d). Default: None, they rest."""
+        del nodes, t, dt
+        return None
+
+    def fluid_walls(
+        self, faces: Faces, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+    ) -> tuple[WallImage, ...]:
         """The maps of these in the columns of nodes around what flows (see `wall_image`)."""
-        walls = wall_images(self.planes(), faces, grid, window, sticks=self.sticks)
+        velocity = self.wall_velocity(grid.nodes(window), t, dt)
+        walls = wall_images(self.planes(t), faces, grid, window, sticks=self.sticks, velocity=velocity)
         if not walls or faces.flowing.all():
             return walls
         flowing = jnp.asarray(faces.flowing, faces.x.dtype)

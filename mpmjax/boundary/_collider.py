@@ -15,15 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import ColliderConditions, Conditions, Slide, no_conditions
-from mpmjax.boundary._plane_contact import FlatWall
+from mpmjax.boundary._contact import AbstractContact
+from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
 from mpmjax.boundary._surface_contact import Surface, refuse_contact
 from mpmjax.checks import between, canonical, require, require_fields
-from mpmjax.discretisation import Grid
+from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, length, still
 
+_ASKEW = 1e-6  # the slope to an axis up to which a half-space is across it: a turned one is so to rounding
 _LOOKS = 4  # places of a particle's way in which a collider is looked for
 
 
@@ -107,27 +109,37 @@ class AbstractCollider(AbstractBoundary):
         )
         return conditions, place, motion.velocity_of(place, t, dt)
 
+    def across_axes(self, t: Scalar) -> tuple[FlatWall, ...]:
+        """The planes of a half-space at time t, one across each axis, infinitely far where the normal is not along it;
+        none of other bodies."""
+        if not isinstance(self.shape, HalfSpace):
+            return ()
+        point, normal = jnp.asarray(self.shape.point), jnp.asarray(self.shape.normal)
+        if self.motion is not None:
+            point, normal = self.motion.place(point[None], t)[0], self.motion.turned(normal[None], t)[0]
+        size = jnp.abs(normal)
+        inward, along = jnp.where(normal < 0, -1, 1), size.sum() - size <= _ASKEW * size
+        places = jnp.where(along, point, jnp.where(normal < 0, jnp.inf, -jnp.inf))
+        return tuple((axis, places[axis], inward[axis]) for axis in range(self.dim))
+
+    def wall_velocity(self, nodes: NodeVector, t: Scalar, dt: Scalar) -> NodeVector | None:
+        return None if self.motion is None else self.motion.velocity_of(self.motion.origin(nodes, t), t, dt)
+
 
 class AbstractHoldingCollider(AbstractCollider):
-    """A body from which material cannot part. It holds the nodes in it; what flows a half-space across an axis that
-    rests holds by columns of nodes as a box does, so that it stays at rest: its motion has no derivative by the
-    half-space's place and normal."""
+    """A body from which material cannot part. It holds the nodes in it; what flows a half-space across an axis holds by
+    columns of nodes as a box does, so that it stays at rest: its motion has no derivative by the half-space's place and
+    normal."""
 
     meets_constraints: ClassVar[bool] = False
 
-    def planes(self) -> tuple[FlatWall, ...]:
-        """One an axis, infinitely far where the normal is not along it."""
-        if self.motion is not None or not isinstance(self.shape, HalfSpace):
-            return ()
-        point, normal = jnp.asarray(self.shape.point), jnp.asarray(self.shape.normal)
-        inward, along = jnp.where(normal < 0, -1, 1), (normal != 0) & ((normal != 0).sum() == 1)
-        places = jnp.where(along, point, jnp.where(normal < 0, jnp.inf, -jnp.inf))
-        return tuple((axis, places[axis], inward[axis]) for axis in range(self.dim))
+    def planes(self, t: Scalar) -> tuple[FlatWall, ...]:
+        return self.across_axes(t)
 
 
 class StickyCollider(AbstractHoldingCollider):
     """A body to which the material sticks: nodes in it have its velocity, exactly, also after a solve. Fluids stay at
-    rest at a half-space across an axis that rests.
+    rest at a half-space across an axis.
 
     In the total description it holds the reference nodes that lie in it before its motion: a grip that can turn.
 
@@ -150,7 +162,7 @@ class StickyCollider(AbstractHoldingCollider):
 
 class SlipCollider(AbstractHoldingCollider):
     """A body along which the material slides freely and from which it cannot part: nodes in it have its velocity along
-    the normal, exactly, also after a solve. Fluids stay at rest at a half-space across an axis that rests.
+    the normal, exactly, also after a solve. Fluids stay at rest at a half-space across an axis.
 
     In the total description only a half-space without rotation: elsewhere the normal of a reference node changes as it
     slides.
@@ -192,7 +204,9 @@ class SeparatingCollider(AbstractCollider):
 
     It has derivatives by its place and size, and those of its motion.
 
-    *When it breaks*: as a `SeparatingBox`. Fluids do not come to rest at it: across an axis take the box. A body or
+    A fluid is held at a half-space across an axis as by a `SeparatingBox`, so that it stays at rest.
+
+    *When it breaks*: as a `SeparatingBox`. Fluids do not come to rest at other shapes. A body or
     part of it that is thinner than two spacings does not keep material out, and one that moves through more than a
     spacing in a step leaves some behind. Not in the total description.
 
@@ -223,6 +237,28 @@ class SeparatingCollider(AbstractCollider):
         normal = motion.turned(slope / jnp.where(sloping, steepness, 1)[:, None], push_time)
         velocity = motion.velocity_of(motion.origin(x, t), t, dt)
         return (Surface(jnp.where(sloping, distance, jnp.inf), normal.T, self.friction, velocity.T),)
+
+    def contacts(
+        self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+    ) -> tuple[AbstractContact, ...]:
+        """Springs, and for what flows at a half-space a plane across each axis, as of a `SeparatingBox`."""
+        assert faces is not None  # as it `pushes`
+        (surface,), planes = self.surfaces(faces.x, t, dt, faces.push_time), self.across_axes(t)
+        springs = surface_contact(surface, faces)
+        if not planes or not faces.flowing.any():
+            return (springs,)
+        along = jnp.isfinite(jnp.stack([position for _, position, _ in planes]))
+        gap = springs.gap  # at the start, of a wall that moves too
+        if self.motion is not None:
+            gap = surface_contact(self.surfaces(faces.x, t, dt, t)[0], faces).gap
+        shut = faces.flowing & (gap <= SHUT * faces.spacing)
+        around = scatter(faces.stencil, (along[:, None] & shut).astype(faces.x.dtype), None, grid.size)
+        walls = wall_images(planes, faces, grid, window, velocity=self.wall_velocity(grid.nodes(window), t, dt))
+        each = enumerate(zip(walls, planes, strict=True))
+        held = [plane_contact((wall,), (plane[2],), self.friction, around[:, k : k + 1]) for k, (wall, plane) in each]
+        # an explicit step's springs push no face before the surface
+        beside = ~(along.any() & (faces.flowing[None] if faces.explicit else shut))
+        return (replace(springs, beside=beside), *held)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         del grid

@@ -3,6 +3,7 @@ flows."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -29,8 +30,9 @@ class PlaneContact(AbstractContact):
 
         Σ m_i (1 − B_i S/M) (v_i − B_i v_b),   S = Σ B m,   M = Σ B² m,
 
-    so that the two conditions exclude each other. Columns that no particle reaches
-    whose face is at the wall are not held. Columns that are each other's image in another plane are held together.
+    so that the two conditions exclude each other; of a wall that moves, v_i is without (1 − B_i) V_i. Columns that no
+    particle reaches whose face is at the wall are not held. Those that are each other's image in another plane are held
+    together.
     Friction acts on the first node of a column that has a tangential velocity of its own.
     """
 
@@ -59,6 +61,8 @@ class PlaneContact(AbstractContact):
         each = []
         for inward, wall in zip(self.inward, self.walls, strict=True):
             rows = wall.rows(along)
+            if wall.velocity is not None:
+                rows = rows - (1 - wall.share) * wall.rows(wall.velocity[:, self.axis])
             each.append(inward * wall.column(column_weight(wall, mass) * (rows - wall.share * wall.row(rows))))
         return self._tied(held, jnp.where(self.shut, jnp.concatenate(each, axis=-1), 0))
 
@@ -88,7 +92,9 @@ class PlaneContact(AbstractContact):
         for wall, part in zip(self.walls, jnp.split(limits, len(self.walls), axis=-1), strict=True):
             limit = wall.with_rows(limit, jnp.where(wall.first, part, wall.rows(limit)))
         normal = (jnp.arange(residual.shape[1]) == self.axis).astype(limit.dtype)
-        return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, 0.0, limit, v)
+        velocity = self.walls[0].velocity  # of a box both rest
+        moving = jnp.zeros((), limit.dtype) if velocity is None else velocity
+        return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, moving, limit, v)
 
     def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """The normal component of nodes that follow in it alone, as on the wall."""
@@ -129,11 +135,11 @@ def with_tied_columns(nodes: N) -> N:
 
 
 def wall_images(
-    planes: tuple[FlatWall, ...], faces: Faces, grid: Grid, window: Int[Array, "d"], *, sticks: bool = False
+    planes: tuple[FlatWall, ...], faces: Faces, grid: Grid, window: Int[Array, "d"], **of_all: Any
 ) -> tuple[WallImage, ...]:
     """The maps of planes for what flows (see `wall_image`)."""
     order, filled = len(faces.stencil.basis.knots) - 1, (faces.stencil, faces.flowing_volume)
-    return tuple(wall_image(*plane, grid, window, order, filled, sticks=sticks) for plane in planes)
+    return tuple(wall_image(*plane, grid, window, order, filled, **of_all) for plane in planes)
 
 
 def column_weight(wall: WallImage, mass: NodeScalar) -> Array:

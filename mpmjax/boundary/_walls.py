@@ -85,8 +85,8 @@ class AbstractBox(AbstractBoundary):
 
 
 class AbstractHoldingBox(AbstractBox):
-    """Walls from which material cannot part. They hold the nodes at and behind them, and what flows, while they rest,
-    by columns of nodes (see `wall_image`), so that it stays at rest."""
+    """Walls from which material cannot part. They hold the nodes at and behind them, and what flows by columns of nodes
+    (see `wall_image`), so that it stays at rest."""
 
     motion: eqx.AbstractVar[Motion | None]  # how the walls move together; None for not at all
 
@@ -109,9 +109,14 @@ class AbstractHoldingBox(AbstractBox):
             fixed = jnp.broadcast_to(fixed.any(axis=1, keepdims=True), nodes.shape)
         return held_by_wall(fixed, self.motion, nodes, t, dt)
 
-    def planes(self) -> tuple[FlatWall, ...]:
-        """Two an axis, while they rest."""
-        return () if self.motion is not None else tuple(chain.from_iterable(map(self.across, range(self.dim))))
+    def planes(self, t: Scalar) -> tuple[FlatWall, ...]:
+        """Two an axis."""
+        walls = chain.from_iterable(map(self.across, range(self.dim)))
+        shift = jnp.broadcast_to(self.displacement(t), self.dim)
+        return tuple((axis, at + shift[axis], inward) for axis, at, inward in walls)
+
+    def wall_velocity(self, nodes: NodeVector, t: Scalar, dt: Scalar) -> NodeVector | None:
+        return None if self.motion is None else self.motion.velocity_of(nodes, t, dt)
 
 
 class StickyBox(AbstractHoldingBox):
@@ -140,8 +145,6 @@ class SlipBox(AbstractHoldingBox):
 
     A fluid is held by columns of nodes whose normal velocity is linear across the wall and zero on it, wherever that
     lies, so that it stays at rest; its motion has no derivative by a wall's place.
-
-    *When it breaks*: a box that moves holds fluids at nodes too, and they press on it by a tenth too much.
 
     Args:
         lower: position of the lower wall in each direction [m], (d,); −inf for none.

@@ -112,11 +112,20 @@ class Image(AbstractImage):
         copied = self._copy(field.reshape(self.layers, *self.shape, -1), signs).reshape(field.shape)
         if self.velocity is None:
             return copied
-        return copied + jnp.where(self.held(self.odd <= 0, field.shape[1]), field, 0)
+        return copied + jnp.where(self.carried(field.shape[1]), field, 0)
 
     def fold(self, field: NodeVector) -> NodeVector:
         at_rest = replace(self, velocity=None)  # what it adds is no part of the linear map
         return transposed(at_rest.vector, field)
+
+    def carried(self, dim: int) -> Mask:
+        """The components that have what the mirror's motion adds, on it and beyond, shape (n, d)."""
+        return self.held(self.odd <= 0, dim)
+
+    def with_motion(self, field: NodeVector) -> NodeVector:
+        """A velocity [m/s] with 2V in its odd components beyond the mirror."""
+        assert self.velocity is not None
+        return jnp.where(self.held((self.odd < 0) | (self.even == 0), field.shape[1]), 2 * self.velocity, field)
 
     def held(self, along: Bool[Array, "m"], dim: int) -> Mask:
         """The odd components of some nodes along the axis, as a mask of shape (n, d)."""
@@ -185,7 +194,11 @@ class Mirror(eqx.Module):
 
     def unfold(self, field: NodeVector) -> NodeVector:
         """B v: fill in the mirror images."""
-        return reduce(lambda field, image: image.vector(field), self.images, field)
+        unfolded = field
+        for image in self.images:
+            unfolded = image.vector(unfolded)
+            unfolded = image.moved(unfolded, field) if isinstance(image, WallImage) else unfolded
+        return unfolded
 
     def fold(self, field: NodeVector) -> NodeVector:
         """Bᵀ f: add to the true nodes what their mirror images received, and leave nothing on the others."""
@@ -198,23 +211,25 @@ class Mirror(eqx.Module):
         return field
 
     @property
-    def moving(self) -> tuple[tuple[Image, Array], ...]:
-        """The mirrors that move, with their velocities [m/s]."""
-        planes = (image for image in self.images if isinstance(image, Image))
-        return tuple((image, image.velocity) for image in planes if image.velocity is not None)
+    def moving(self) -> tuple[Image | WallImage, ...]:
+        """The mirrors and walls that move."""
+        planes = (image for image in self.images if isinstance(image, Image | WallImage))
+        return tuple(image for image in planes if image.velocity is not None)
 
     def added(self, field: NodeVector) -> NodeVector:
         """The part of a velocity that mirrors which move add to it, on them and beyond; zero elsewhere."""
         total = jnp.zeros_like(field)
-        for image, _ in self.moving:
-            total = jnp.where(image.held(image.odd <= 0, field.shape[1]), field, total)
+        for image in self.moving:
+            total = jnp.where(image.carried(field.shape[1]), field, total)
         return total
 
     def with_motion(self, velocity: NodeVector) -> NodeVector:
-        """A velocity [m/s], shape (n, d), with 2V in its odd components beyond mirrors that move."""
-        for image, V in reversed(self.moving):  # where several reach, the first one holds
-            beyond = image.held((image.odd < 0) | (image.even == 0), velocity.shape[1])
-            velocity = jnp.where(beyond, 2 * V, velocity)
+        """A velocity [m/s], shape (n, d), with 2V in its odd components beyond mirrors that move, and (1 − B) V behind
+        walls that do. Where several mirrors reach, the first one holds, of walls the last."""
+        images = self.moving
+        walls = [image for image in images if isinstance(image, WallImage)]
+        for image in (*reversed([image for image in images if isinstance(image, Image)]), *walls):
+            velocity = image.with_motion(velocity)
         return velocity
 
     def unfold_scalar(self, field: Float[Array, "n"]) -> Float[Array, "n"]:

@@ -27,6 +27,9 @@ class WallImage(eqx.Module):
     first: Bool[Array, "..."]  # the first row from behind that has a tangential velocity of its own
     held: Bool[Array, "..."] | None = None  # the columns where the wall holds; None for all of them
     sticks: bool = eqx.field(static=True, default=False)  # whether the rows behind b have its whole velocity times B
+    velocity: NodeVector | None = None
+    """Velocity V of a wall that moves, at the nodes [m/s], shape (n, d); None at rest. Where rows follow b by B they
+    have B v_b + (1 − B) V."""
 
     def blocks(self, field: Array) -> Array:
         """A field of shape (n,) or (n, c), or blocks, as blocks."""
@@ -62,6 +65,22 @@ class WallImage(eqx.Module):
         nodes = jnp.zeros((self.layers, *self.shape, 1), bool)
         return jnp.broadcast_to(self.with_rows(nodes, self.rows(nodes) | mask).reshape(-1, 1), shape)
 
+    def carried(self, dim: int) -> Mask:
+        """The components that follow b by B, shape (n, d). Of a wall that moves a field has there what its motion
+        adds."""
+        follows, rows = self._moved(dim), self.rows(jnp.zeros((self.layers, *self.shape, dim), bool))
+        return self.with_rows(jnp.zeros((self.layers, *self.shape, dim), bool), rows | follows).reshape(-1, dim)
+
+    def with_motion(self, field: NodeVector) -> NodeVector:
+        """A velocity [m/s] with (1 − B) V in these components."""
+        assert self.velocity is not None
+        added = (1 - self.share) * self.rows(self.velocity)
+        return self.with_rows(field, jnp.where(self._moved(field.shape[1]), added, self.rows(field)))
+
+    def _moved(self, dim: int) -> Array:
+        follows = self.follows if self.held is None else self.follows & self.held
+        return follows & ((jnp.arange(dim) == self.axis) | self.sticks)
+
     def scalar(self, field: Array) -> Array:
         """B for an even scalar field."""
         return self._copied(field, self.tied, 1)
@@ -79,6 +98,13 @@ class WallImage(eqx.Module):
     def vector(self, field: NodeVector) -> NodeVector:
         """B for a vector field."""
         return self._copied(field, *self._components(jnp.arange(field.shape[1]) == self.axis, self.share))
+
+    def moved(self, unfolded: NodeVector, field: NodeVector) -> NodeVector:
+        """A field that `vector` has unfolded, with what the wall's motion adds to it as the `field` before has it."""
+        if self.velocity is None:
+            return unfolded
+        added = jnp.where(self._moved(field.shape[1]), self.rows(field), 0)
+        return self.with_rows(unfolded, self.rows(unfolded) + added)
 
     def fold(self, field: NodeVector) -> NodeVector:
         """Bᵀ for a vector field."""
@@ -114,6 +140,7 @@ def wall_image(
     filled: tuple[Stencil, Float[Array, "p"]] | None = None,
     *,
     sticks: bool = False,
+    velocity: NodeVector | None = None,
 ) -> WallImage:
     """The map of a wall at any coordinate [m] along an axis, for a kernel of this order; `inward` is the component of
     its inward normal, +1 or −1.
@@ -166,4 +193,5 @@ def wall_image(
         tied=(follows & ~stays).reshape(by_row),
         first=(stays & (before - 1 <= -0.25 - near)).reshape(by_row),
         sticks=sticks,
+        velocity=velocity,
     )

@@ -16,7 +16,6 @@ from mpmjax._types import Array, Bool, Float, Int, ParticleVector
 from mpmjax.boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.checks import warn
 from mpmjax.discretisation import BSpline, Grid
-from mpmjax.geometry import HalfSpace
 from mpmjax.material import AbstractLaw
 from mpmjax.state._particles import Particles
 from mpmjax.state._scene import Scene
@@ -59,11 +58,6 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
                 why = ", or nearer to it than a quarter of their width: it pushes their faces away, half a width"
                 why += " before their centres. Move one of them."
             warn(f"{inside} of {len(x)} particles lie in or beyond the {name} at the start{why}")
-        if any(law.flows for law in scene.laws) and _stirs_fluids(condition):
-            warn(
-                f"The {name} pushes the faces of a fluid and so stirs it, by a tenth or more of the pressure at its "
-                "floor: across an axis take a SymmetryPlane, ContactPlane or SeparatingBox."
-            )
         if mask is not None:
             may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
             if not may_meet:  # only the nodes in a particle's stencil
@@ -185,13 +179,6 @@ def _probe(
         return acts if colliders is None else acts | colliders.touched
 
     return [covered(b) for b in boundary], [touched(b) if r else None for b, r in zip(boundary, resting, strict=True)]
-
-
-def _stirs_fluids(boundary: AbstractBoundary) -> bool:
-    """Whether it is a collider at rest across an axis at which fluids find no rest."""
-    shape, rests = getattr(boundary, "shape", None), getattr(boundary, "motion", None) is None
-    across = isinstance(shape, HalfSpace) and np.count_nonzero(jnp.asarray(shape.normal)) == 1
-    return bool(boundary.pushes and rests and across)
 
 
 def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Any) -> Any:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, NodeVector, Scalar
 from mpmjax.boundary import (
+    ConstrainedNodes,
     Impulses,
     OwnedImpulse,
     owners_of,
@@ -33,7 +34,7 @@ def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator,
     held, numbers = new.held(nodes), _boundaries_of_colliders(scene)
     holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
     parts = list(held.along_normals(holding))
-    of_walls, holding = taken_by_mirrors(held.without_collider_impulses(holding), _walls_of(nodes))
+    of_walls, holding = taken_by_mirrors(held.without_collider_impulses(holding), _walls_of(held))
     for part in of_walls:
         if isinstance(part.owner, int) and part.owner in numbers:
             parts.append(replace(part, owner=numbers.index(part.owner)))
@@ -107,9 +108,7 @@ def impulse_on_boundaries(
     for part in held.along_normals(residual):
         parts.append(OwnedImpulse(part.impulse, jnp.where(part.owner < 0, -1, numbers[part.owner])))
         residual = residual - part.impulse
-    brought = [(number, contact.images(active)) for number, contact, active in contacts if number is not None]
-    columns = [*((number, image) for number, images in brought for image in images), *_walls_of(nodes)]
-    of_planes, residual = taken_by_mirrors(residual, columns)
+    of_planes, residual = taken_by_mirrors(residual, _walls_of(held))
     parts += [*of_planes, OwnedImpulse(residual, owners)]
     taken = owners >= 0
     for number, contact, active in contacts:
@@ -141,9 +140,13 @@ def impulse_on_boundaries(
     return received_impulses(parts, places, pivots, couples)
 
 
-def _walls_of(nodes: Nodes) -> list[tuple[int, WallImage]]:
-    """The walls that hold what flows at all times, with the numbers of their boundaries."""
-    return [(number, wall) for number, walls in enumerate(nodes.walls) for wall in walls]
+def _walls_of(held: ConstrainedNodes[Nodes]) -> list[tuple[int, WallImage]]:
+    """The walls across axes that hold columns, of contacts and those that are never left, with the numbers of their
+    boundaries."""
+    nodes = held.unconstrained
+    contacts = zip(nodes.brought_by, nodes.contacts, held.active, strict=True)
+    brought = [(number, contact.images(active)) for number, contact, active in contacts if number is not None]
+    return [(number, wall) for number, walls in (*brought, *enumerate(nodes.walls)) for wall in walls]
 
 
 def _boundaries_of_colliders(scene: Scene) -> list[int]:

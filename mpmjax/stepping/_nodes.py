@@ -134,9 +134,14 @@ class Nodes(AbstractNodes):
     def folded(self, images: Mirror, mass: NodeScalar | None = None) -> "Nodes":
         """The nodes with the sums of their images at mirror planes added. A force is folded as the momentum that it
         makes is; the folded mass may be known already."""
-        conditions = replace(self.conditions, moves=self.conditions.moves or bool(images.moving))
         mass = images.fold_scalar(self.mass) if mass is None else mass
-        folded = replace(self, mass=mass, conditions=conditions)
+        folded, v, put_back = replace(self, mass=mass), self.v, None
+        if images.moving:  # at rest with the mirrors: the velocity less what they add, which is put back
+            put_back = images.with_motion(jnp.where(self.conditions.fixed, self.conditions.velocity, 0))
+            put_back = images.added(put_back)
+            v = v - jnp.where(self.occupied, images.unfold(put_back), 0)
+            put_back = jnp.where(folded.occupied, put_back, 0)
+            folded = replace(folded, conditions=replace(self.conditions, moves=True))
 
         def fold(field: Array) -> NodeVector:
             """Fold a field per mass."""
@@ -144,7 +149,7 @@ class Nodes(AbstractNodes):
 
         return replace(
             folded,
-            v=fold(self.v),
+            v=fold(v) if put_back is None else fold(v) + put_back,
             f=None if self.f is None else images.fold(self.f),
             g=None if self.g is None else fold(self.g),
             potential=replace(self.potential, mirror=Mirror(images.images + self.potential.mirror.images)),
@@ -154,7 +159,9 @@ class Nodes(AbstractNodes):
         """The nodes folded at these mirrors to these masses, with the components `fixed` held, and the force of further
         terms."""
         nodes = self.folded(images, mass) if images.images else self
-        nodes = replace(nodes, conditions=replace(self.conditions, fixed=fixed, holds=True))
+        for wall in images.moving if images.images else ():
+            fixed = fixed | wall.carried(fixed.shape[1])
+        nodes = replace(nodes, conditions=replace(nodes.conditions, fixed=fixed, holds=True))
         if not terms:
             return nodes
         potential = replace(nodes.potential, terms=nodes.potential.terms + terms)
@@ -243,10 +250,10 @@ def with_boundaries(
         moved = places_of(particles, potential.stencil, grid.size)
         place = jnp.where(slid[:, None] & nodes.occupied, moved, conditions.colliders.position)
         conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
-    faces, walls, flows = None, (), any(law.flows for law in scene.laws) and any(b.planes() for b in scene.boundary)
+    faces, walls, flows = None, (), any(law.flows for law in scene.laws) and any(b.planes(t) for b in scene.boundary)
     if flows or any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
         faces = faces_of(scene, particles, potential, t, dt, force_at)
-        walls = tuple(boundary.fluid_walls(faces, grid, window) for boundary in scene.boundary) if flows else ()
+        walls = tuple(boundary.fluid_walls(faces, grid, window, t, dt) for boundary in scene.boundary) if flows else ()
     each = enumerate(scene.boundary)
     brought = [(n, contact) for n, boundary in each for contact in boundary.contacts(faces, grid, window, t, dt)]
     contacts, brought_by = [contact for _, contact in brought], [number for number, _ in brought]
@@ -277,14 +284,7 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar
         v, fixed, prescribed = layers
         conditions = Conditions(fixed, prescribed, nodes.conditions.colliders)
         return replace(nodes, v=v, conditions=conditions, loose=loose, tied=tied)
-    if not images.images:
-        return nodes
-    if not images.moving:
-        return nodes.folded(images)
-    # at rest with the mirrors: the velocity less what they add, which is put back
-    added = images.added(images.with_motion(jnp.where(nodes.conditions.fixed, nodes.conditions.velocity, 0)))
-    nodes = replace(nodes, v=nodes.v - jnp.where(nodes.occupied, images.unfold(added), 0)).folded(images)
-    return replace(nodes, v=nodes.v + jnp.where(nodes.occupied, added, 0))
+    return nodes.folded(images) if images.images else nodes
 
 
 def start_nodes(
