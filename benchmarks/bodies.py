@@ -26,6 +26,12 @@ DOCS = Path(__file__).parents[1] / "docs"
 G = 10.0  # m/s²
 DENSITY = 1e3  # kg/m²
 HELD = mpm.StickyBox((-np.inf, 0.0), (np.inf, np.inf))
+IMPLICIT = {
+    "semi-implicit": mpm.SemiImplicit(),
+    "backward Euler": mpm.BackwardEuler(),
+    "midpoint": mpm.ImplicitMidpoint(),
+    "TR-BDF2": mpm.TRBDF2(),
+}
 
 
 def contact_of(scene: mpm.Scene, particles: mpm.Particles, t: float = 0.0) -> tuple:
@@ -153,26 +159,36 @@ def on_slope(angle: float, friction: float) -> tuple[mpm.Scene, mpm.Particles, s
     return scene, mpm.join(slab, block), slice(slab.count, None)
 
 
+class Tilting(mpm.state.AbstractBodyForce):
+    """The weight of what is put down in 0.3 s, and then with all below it tilted to an angle in 1 s, without jerks."""
+
+    angle: float
+
+    def acceleration(self, x: jax.Array, t: jax.Array) -> jax.Array:
+        (put, turned) = (s**3 * (10 - 15 * s + 6 * s**2) for s in jnp.clip(jnp.stack([t / 0.3, t - 0.3]), 0, 1))
+        angle = self.angle * turned
+        return jnp.broadcast_to(G * put * jnp.stack([jnp.sin(angle), -jnp.cos(angle)]), x.shape)
+
+
 def tilted(method: AbstractIntegrator, friction: float = 0.8) -> tuple[float, float]:
-    """How far a block moves [mm] on a slab that is tilted to 30 degrees in 1.2 s, and then in half a second at rest."""
-    places = []
-    particles = None
-    for angle in (*np.linspace(0, np.pi / 6, 6), np.pi / 6, np.pi / 6):
-        scene, start, rows = on_slope(angle, friction)
-        particles = mpm.simulate(scene, particles or start, t1=0.25, dt=0.01, method=method).final
-        places.append(1e3 * float(particles.x[rows, 0].mean()))
-    return places[-3] - places[0], places[-1] - places[-3]
+    """How far a block moves [mm] on a slab that is tilted to 30 degrees, and then in half a second at rest: by its mean
+    place in a quarter of a second, in which it has swung four times."""
+    scene, start, rows = on_slope(0.0, friction)
+    scene = dataclasses.replace(scene, gravity=(0.0, 0.0), body_force=Tilting(np.pi / 6))
+    run = mpm.simulate(scene, start, t1=2.05, dt=0.01, method=method, observe=lambda _, p: p.x[rows, 0].mean())
+    x = 1e3 * np.asarray(run.observed)
+    return x[-75:-50].mean() - x[30], x[-25:].mean() - x[-75:-50].mean()
 
 
 def slope(quick: bool) -> None:
     """The block on a slope of 30 degrees, and tilted to it."""
     angle = np.pi / 6
-    for method in (mpm.SemiImplicit(), mpm.BackwardEuler(), mpm.TRBDF2())[: 1 if quick else 3]:
-        by, then = tilted(method)
-        print(f"a block tilted to 30 degrees at μ = 0.8, {type(method).__name__}: {by:.1f} mm, then {then:+.2f} mm")
+    for name in list(IMPLICIT)[: 1 if quick else 4]:
+        by, then = tilted(IMPLICIT[name])
+        print(f"a block tilted to 30 degrees at μ = 0.8, {name}: {by:.1f} mm, then {then:+.2f} mm")
     print("a block on a slope of 30 degrees, from 0.25 to 0.5 s: what it gains over what the closed form says")
-    for name, friction in product(("explicit", "semi-implicit"), (0.0, 0.3, 0.8)):
-        method, steps = (mpm.Explicit(), 420) if name == "explicit" else (mpm.SemiImplicit(), 60)
+    for name, friction in product(("explicit", *IMPLICIT), (0.0, 0.3, 0.8)):
+        method, steps = (mpm.Explicit(), 420) if name == "explicit" else (IMPLICIT[name], 60)
         scene, particles, rows = on_slope(angle, friction)
         run = mpm.simulate(scene, particles, t1=0.5, dt=0.5 / steps, method=method, save_every=steps // 2)
         v = np.asarray(run.frames.v)[1:, rows].mean(axis=1)

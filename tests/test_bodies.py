@@ -251,7 +251,7 @@ def slid(name, friction, *, steps, dt):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", ["explicit", "semi_implicit"])
+@pytest.mark.parametrize("name", ["explicit", "semi_implicit", "implicit_midpoint", "trbdf2"])
 def test_a_block_slides_down_a_slope_as_the_closed_form_says(name):
     """Δv = g t sin θ − μ (g t cos θ + Δv_n) within 1 %, from when it slides; what is in brackets is the push by the
     block's own momentum across the slope. Without vibrations that is Δv = g t (sin θ − μ cos θ)."""

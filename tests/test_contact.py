@@ -290,6 +290,46 @@ def test_a_body_pressed_into_a_corner_feels_symmetry_planes(case, name):
         assert_close(getattr(held, field), getattr(mirrored, field), 1e-11)
 
 
+EDGES = {  # y = 0 with the coefficient 0.2 and z = 0 with 0.3
+    "boxes": tuple(
+        mpm.SeparatingBox([0.0 if k == axis else -np.inf for k in range(3)], (np.inf,) * 3, friction=friction)
+        for axis, friction in ((1, 0.2), (2, 0.3))
+    ),
+    "planes": (mpm.ContactPlane(1, 0.0, friction=0.2), mpm.ContactPlane(2, 0.0, friction=0.3)),
+    "colliders": tuple(
+        mpm.SeparatingCollider(mpm.HalfSpace((0.0,) * 3, normal), friction=friction)
+        for normal, friction in (((0.0, 1.0, 0.0), 0.2), ((0.0, 0.0, 1.0), 0.3))
+    ),
+}
+EDGES["box and plane"] = EDGES["boxes"][0], EDGES["planes"][1]
+
+
+@pytest.mark.parametrize(
+    ("walls", "law", "name"),
+    [
+        ("box and plane", "solid", "explicit"),
+        *thorough(*((walls, "solid", "semi_implicit") for walls in EDGES), ("boxes", "solid", "trbdf2")),
+        *thorough(("planes", "solid", "explicit"), ("colliders", "solid", "explicit")),
+        *thorough(("boxes", "fluid", "explicit"), ("planes", "fluid", "semi_implicit")),
+    ],
+)
+def test_along_the_edge_of_two_walls_friction_is_that_of_both(walls, law, name):
+    """Δv_x = −Σ μ_k (g_k t + Δv_k) within 2 %, the sum being that of both pushes: what moves across one wall turns the
+    other's friction by little. In either order of walls of both kinds, to rounding."""
+    grid, weight, steps = mpm.Grid((12, 8, 8), 0.1, origin=(-3, -3, -3)), jnp.asarray([0.0, -6.0, -10.0]), 8
+    body = mpm.fill(mpm.Box((0.0,) * 3, (0.3, 0.2, 0.2)), grid, density=1e3, velocity=(5.0, 0.0, 0.0))
+    laws, changes = {"solid": mpm.NeoHookean(1e5, 0.3), "fluid": mpm.Fluid(1e5)}, []
+    turned = [EDGES[walls][::-1]] if (walls, name) == ("box and plane", "semi_implicit") else []
+    for boundary in (EDGES[walls], *turned):
+        scene = mpm.Scene(grid, laws[law], gravity=weight, boundary=boundary)
+        end = mpm.rollout(scene, body, steps=steps, dt=4e-3, method=(METHODS | OTHERS)[name])
+        changes.append(np.asarray((end.v - body.v).mean(axis=0)))
+    push = changes[0][1:] - steps * 4e-3 * np.asarray(weight)[1:]
+    assert push.min() > 0.05
+    assert_close(-changes[0][0], 0.2 * push[0] + 0.3 * push[1], 2e-2)
+    assert_close(changes[-1], changes[0], 1e-10)
+
+
 class Searching(mpm.Explicit):
     """An explicit step that looks for its active set, where its guess is right at once too."""
 

@@ -222,8 +222,12 @@ class BodyContact(AbstractSpringContact):
         """Opposite impulses on the two bodies, at most as large as those that stop the slip that springs have left."""
         count, (first, second) = len(self.gap), self.pair
         push = jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0)
-        taken = self.dt * self.stiffness * self.grip * length(self._stretched(held)[1:].T)
-        limit = jnp.tile(jnp.maximum(self.coefficient * push - taken, 0), len(residual) // count)
+        taken = jnp.where(active, self.dt * self.stiffness * self.grip * length(self._stretched(held)[1:].T), 0)
+        left = self.coefficient * push - taken
+        # what springs take beyond the limit at some nodes the others lack: else what rests would hold at any angle
+        rest, whole = jnp.maximum(left, 0), jnp.maximum(left, 0).sum()
+        rest = rest * jnp.maximum(left.sum(), 0) / jnp.where(whole > 0, whole, 1)
+        limit = jnp.tile(rest, len(residual) // count)
         limit = held.nodes.potential.mirror.fold_scalar(limit).reshape(-1, count)[first]
         mass = held.nodes.mass.reshape(-1, count)
         reduced = series_stiffness(mass[first], mass[second], mass[first] + mass[second] != 0)
