@@ -2,12 +2,14 @@
 
 python benchmarks/boundary_forces.py             # a block pressed, a rod twisted, and docs/boundary_forces.png
 python benchmarks/boundary_forces.py --quick     # coarser, no picture
+python benchmarks/boundary_forces.py --square    # a square bar twisted alone, by grips and clamps
 
 The block lies between four smooth plates, of which one moves and comes back. Its strain is even to first order, so that
 of the force of inertia m a/2, with a the plate's acceleration, the plate itself carries m a/3 and the opposite one
 m a/6, beside the law's own stress. The rod is held at one end and turned at the other, without inertia.
 """
 
+import itertools
 import sys
 from pathlib import Path
 
@@ -58,14 +60,20 @@ def closed(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return -SIDE * stress - inertia / 3, -SIDE * stress + inertia / 6, -SIDE * LAM * np.log(s)
 
 
-def twisted(across: int, order: int, clamped: bool) -> tuple[np.ndarray, np.ndarray, int]:
-    """Angles, the torques on both grips or clamps, shape (f, 2), and the number of particles."""
+def twisted(
+    across: int, order: int, clamped: bool, *, square: bool = False, per_side: int = 2
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Angles, the torques on both grips or clamps, shape (f, 2), and the number of particles, of the rod or of a square
+    bar as wide."""
     dx = 2 * RADIUS / across
     half = across // 2 + 3
     grid = mpm.Grid((2 * half, 2 * half, round(LENGTH / dx) + 6), dx, origin=(-half, -half, -3))
-    rod = mpm.fill(mpm.geometry.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, LENGTH), RADIUS), grid, density=DENSITY)
-    still, steps, t1 = ((0.0, 0.0, 0.0),) * 2, 10, 1e3
-    turn = mpm.RigidMotion((0.0, t1), still, ((0.0, 0.0, 0.0), (0.0, 0.0, ANGLE)), (0.0, 0.0, LENGTH))
+    region = mpm.geometry.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, LENGTH), RADIUS)
+    still, steps, angle, t1 = ((0.0, 0.0, 0.0),) * 2, 10, ANGLE, 1e3
+    if square:
+        region, steps, angle = mpm.Box((-RADIUS, -RADIUS, 0.0), (RADIUS, RADIUS, LENGTH)), 2, 0.02
+    rod = mpm.fill(region, grid, particles_per_cell=per_side**3, density=DENSITY)
+    turn = mpm.RigidMotion((0.0, t1), still, ((0.0, 0.0, 0.0), (0.0, 0.0, angle)), (0.0, 0.0, LENGTH))
     grips = (
         mpm.Grip(mpm.Box((-9.0, -9.0, -9.0), (9.0, 9.0, 0.0)), mpm.Motion((0.0, t1), still)),
         mpm.Grip(mpm.Box((-9.0, -9.0, LENGTH), (9.0, 9.0, 9.0)), turn),
@@ -76,7 +84,17 @@ def twisted(across: int, order: int, clamped: bool) -> tuple[np.ndarray, np.ndar
     scene = mpm.Scene(grid, LAW, boundary=grips, boundary_forces=True, **choices)
     run = mpm.simulate(scene, rod, t1=t1, dt=t1 / steps, method=mpm.BackwardEuler(), save_every=1)
     torque = np.asarray(run.boundary_forces().torque[:, :, 2])
-    return ANGLE * np.arange(1, steps + 1) / steps, torque, rod.count
+    return angle * np.arange(1, steps + 1) / steps, torque, rod.count
+
+
+def square() -> None:
+    """Print torques of a square bar over Saint-Venant's 0.1406 μ a⁴ θ/L, of small angles."""
+    cases = (4, 2, 2), (4, 2, 3), (4, 1, 2), (8, 2, 2)  # cells across, order of the kernel, particles along an edge
+    for (across, order, per_side), clamped in itertools.product(cases, (False, True)):
+        angle, torque, count = twisted(across, order, clamped, square=True, per_side=per_side)
+        share = np.abs(torque[-1]) / (0.1406 * MU * (2 * RADIUS) ** 4 * angle[-1] / LENGTH)
+        held = "clamps" if clamped else "grips"
+        print(f"square bar, {across} cells, {held}, order {order}, {count} particles: {share}", flush=True)
 
 
 def main(quick: bool) -> None:
@@ -121,4 +139,4 @@ def main(quick: bool) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main("--quick" in sys.argv)
+    square() if "--square" in sys.argv else main("--quick" in sys.argv)

@@ -83,6 +83,31 @@ def test_of_what_is_well_nothing_is_told(scene):
     assert meet(**scene) == []
 
 
+@pytest.mark.parametrize(
+    ("upper", "lower", "gap", "scene", "told"),
+    [
+        (1e4, 2e6, 0.0, {}, True),
+        (1e4, 2e6, 0.25, {}, False),  # they share no node
+        (1e4, 0.9e6, 0.0, {}, False),
+        (1e4, 2e6, 0.0, {"bodies": mpm.Bodies()}, False),
+        (1e4, 2e6, 0.0, TOTAL | {"kernel": mpm.BSpline(1)}, False),
+    ],
+)
+def test_stiffness_that_jumps_within_a_cell_is_told_of(upper, lower, gap, scene, told):
+    grid = mpm.Grid((9, 15), 0.1, origin=(-3, -3))
+    boxes = mpm.Box((0.0, 0.3 + gap), (0.3, 0.6 + gap)), mpm.Box((0.0, 0.0), (0.3, 0.3))
+    sets = [mpm.fill(box, grid, density=1e3) for box in boxes]
+    stiffness = np.repeat([upper, lower], [q.count for q in sets])
+    laws = [tuple(mpm.NeoHookean(E, 0.3) for E in (upper, lower))]
+    if told:  # one law whose parameters jump
+        laws.append(mpm.NeoHookean(jnp.asarray(stiffness), 0.3))
+    for law in laws:
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            mpm.prepare(mpm.Scene(grid, law, **scene), mpm.join(*sets))
+        assert [bool(re.search("Near .* moduli differ 2e.02 times", str(w.message))) for w in said] == [True] * told
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_a_body_thinner_than_two_cells_is_told_of(d):
     """But not one that fills what lies between walls or planes, or the period."""

@@ -121,3 +121,22 @@ def test_smoothing_keeps_a_constant_and_takes_what_alternates(d):
     sign = jnp.where(jnp.round(particles.x[:, 0] / 0.05 - 0.5) % 2 == 0, 1.0, -1.0)
     inside = np.abs(np.asarray(particles.x[:, 0]) - 0.2) < 0.1
     assert np.abs(analysis.smoothed(scene, particles, sign))[inside].max() < 0.1
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_smoothing_is_even_where_nodes_are_in_balance_however_stresses_scatter(order):
+    """As they do where materials of different stiffness share nodes."""
+    cells, kernel = 12, mpm.BSpline(order)
+    grid = mpm.Grid((cells + 8,), 1.0, origin=(-4,))
+    particles = mpm.fill(mpm.Box((0.0,), (float(cells),)), grid, particles_per_cell=2, density=1.0)
+    choices = {"kernel": kernel, "gradient": mpm.SplineGradient()}
+    scene = mpm.Scene(grid, mpm.Hencky(1.0, 0.0), **choices)
+    stencil = scene.stencil(mpm.prepare(scene, particles))
+    forces = np.zeros((grid.size, particles.count))  # of a stress at each particle on each node
+    np.add.at(forces, (stencil.index, np.arange(particles.count)), stencil.gradient[:, 0] * particles.volume)
+    within = forces[6 : cells + 3]  # nodes that no end is near
+    stress = np.random.default_rng(0).uniform(-1, 1, particles.count)
+    stress = 1 + stress - np.linalg.pinv(within) @ (within @ stress)  # those parts that leave these nodes at rest
+    mean = np.asarray(analysis.smoothed(scene, particles, stress))[6:-6]
+    assert np.ptp(stress) > 1
+    assert_close(mean, np.full_like(mean, mean[0]), 1e-12)

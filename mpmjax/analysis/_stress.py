@@ -1,6 +1,7 @@
 """Stress and density of particles, and the numbers that are plotted of them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Float, ParticleScalar, components
 from mpmjax.analysis._budget import energy_density
 from mpmjax.checks import canonical, checked
-from mpmjax.discretisation import gather, in_space, scatter
+from mpmjax.discretisation import BSpline, gather, in_space, scatter
 from mpmjax.state import Particles, Scene, prepare, velocity_gradient
 
 
@@ -53,14 +54,20 @@ def density(scene: Scene, particles: Particles) -> ParticleScalar:
 
 @checked
 def smoothed(scene: Scene, particles: Particles, values: ParticleScalar) -> ParticleScalar:
-    """Averages of values over the particles around each one, shape (p,), for pictures: the values at the nodes,
-    Σ_p w_ip V0_p f_p / Σ_p w_ip V0_p, interpolated back by the scene's kernel."""
-    scene = canonical(scene, particles.x.dtype)
-    stencil = scene.stencil(prepare(scene, particles))
+    """Averages of values over the particles around each one, shape (p,), for pictures: the values Σ_p w V0_p f_p /
+    Σ_p w V0_p at the middles of cells, interpolated back, with weights w of the scene's kernel of one order less (a
+    linear kernel's at the nodes). In one dimension Σ_p w V0_p P_p/dx is the force through the middle of a cell by the
+    balance of nodes, with the spline's gradient at rest: right beside a material of any stiffness too.
+    """
+    scene, particles = canonical(scene, particles.x.dtype), prepare(scene, particles)
+    if scene.kernel.order > 1:
+        scene = eqx.tree_at(lambda s: s.kernel, scene, BSpline(scene.kernel.order - 1))
+        shifted = scene.anchor(particles) + scene.grid.spacing / 2
+        particles = replace(particles, **{"X" if scene.total else "x": shifted})
+    stencil = scene.stencil(particles)
     volume = particles.volume
     sums = scatter(stencil, jnp.stack([volume * values, volume]), None, scene.grid.size)
-    filled = sums[:, 1] > 0
-    nodes = jnp.where(filled, sums[:, 0] / jnp.where(filled, sums[:, 1], 1), 0)
+    nodes = sums[:, 0] / jnp.where(sums[:, 1] > 0, sums[:, 1], 1)
     return gather(stencil, nodes[:, None])[0][0]
 
 

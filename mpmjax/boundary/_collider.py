@@ -20,7 +20,7 @@ from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import ColliderConditions, Conditions, Slide, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
-from mpmjax.boundary._surface_contact import Surface, refuse_contact
+from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import between, canonical, require, require_fields
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, length, still

@@ -62,8 +62,8 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     the neighbours, zero where all are alike. Velocities that are changed afterwards need a C of their own.
 
     Of particles that meet a scene for the first time it warns where walls or colliders lie over them, grips or
-    colliders touch nothing, a body is thinner than two cells, and positions are so far from zero that their precision
-    rounds them to more than 2⁻¹² spacings.
+    colliders touch nothing, a body is thinner than two cells, moduli jump by more than a hundred within a cell, and
+    positions are so far from zero that their precision rounds them to more than 2⁻¹² spacings.
 
     Raises:
         ValueError: a value is not as its module requires (`equinox.tree_at` can make it so), the particles have

@@ -28,6 +28,7 @@ _MOST_CELLS = 10**7  # cells up to which it is looked for
 _THIN = 2.0  # a body thinner than so many cells is not resolved
 _MOST_ROUNDING = 2.0**-12
 """Rounding of positions, in spacings, up to which it is not warned of: some 2 000 cells from zero in float32."""
+_CONTRAST = 100  # ratio of moduli within a cell from which it is warned of
 
 
 def warn_of_setup(scene: Scene, particles: Particles) -> None:
@@ -103,7 +104,45 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
                 f"{which} is {thickness:.2g} cells thick in direction {axis}, and below {_THIN:g} its stiffness is the "
                 "grid's: take a smaller spacing."
             )
+    if not (total and scene.kernel.order == 1):
+        _warn_of_contrast(scene, particles, there)
     warn_of_rounding(grid, particles.x)
+
+
+def _warn_of_contrast(scene: Scene, particles: Particles, there: np.ndarray) -> None:
+    """Warn where solids that share nodes have very different moduli within a cell."""
+    if len(scene.laws) == 1 and all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.material)):
+        return
+    modulus, dx = np.concatenate(_moduli(scene.laws, particles)), float(scene.grid.spacing)
+    there = there[modulus[there] > 0]
+    modulus = modulus[there]
+    if not there.size or modulus.max() <= _CONTRAST * modulus.min():
+        return
+    layer = np.repeat(scene.layers, particles.sizes)[there]
+    cell = np.floor(np.asarray(particles.x, float)[there] / dx).astype(np.int64)
+    corners = [np.c_[cell + corner, layer] for corner in itertools.product((0, 1), repeat=scene.grid.dim)]
+    nodes, at = np.unique(np.concatenate(corners), axis=0, return_inverse=True)
+    most, least = np.zeros(len(nodes)), np.full(len(nodes), np.inf)
+    for extreme, each in ((np.maximum, most), (np.minimum, least)):
+        extreme.at(each, at.ravel(), np.tile(modulus, len(corners)))
+    ratio, first = most / least, int((most / least).argmax())
+    if ratio[first] > _CONTRAST:
+        which = "BSpline(1) with it on nodes" if scene.total else "Bodies, if they press on each other"
+        warn(
+            f"Near {nodes[first, :-1] * dx} m moduli differ {ratio[first]:.2g} times within a cell. Beside such an "
+            "interface the soft material is held over up to three quarters of a cell, and stresses of single particles "
+            f"are up to ten times too large: take {which}, or a finer grid."
+        )
+
+
+@eqx.filter_jit
+def _moduli(laws: tuple[AbstractLaw, ...], particles: Particles) -> list[Float[Array, "q"]]:
+    """The wave moduli at rest of each material's particles [Pa]; zero of what flows or is rigid."""
+    moduli = []
+    for law, group in zip(laws, particles.groups, strict=True):
+        solid = float(not law.flows and law.constraint is None)
+        moduli.append(solid * law.contact_modulus(group.deformation(), group.history))
+    return moduli
 
 
 def warn_of_rounding(grid: Grid, x: ParticleVector, before: ParticleVector | None = None) -> None:
