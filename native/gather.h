@@ -131,7 +131,7 @@ struct Nodes {
   int32_t most;  // the last node of a row that can be read in whole fours, which reach beyond it, or -1
   Runs<T, d, s, columns> runs;
   bool joined = false;  // whether rows are read by runs
-  Row stored[rows];     // if they are not, in C order of the axes before the last
+  Row stored[rows];     // if they are not, or for a pull, in C order of the axes before the last
 
   MPMJAX_INLINE Nodes(const Block<T, d, s>& block, int q, const T* whole, int64_t size, int64_t all, int64_t column,
                       const Block<T, d, s>* derivatives = nullptr)
@@ -142,7 +142,10 @@ struct Nodes {
     most = extent < reach ? -1 : smaller(last, INT32_MAX);
     const Index least = load_as<Index>(block.least + q), ends = load_as<Index>(block.most + q);
     const bool whole_rows = !any((load_as<Index>(block.contiguous + q) == 0) | (least < 0) | (ends > most));
-    if constexpr (permutes) joined = whole_rows && runs.find(block, q, size);
+    if constexpr (permutes) {
+      joined = whole_rows && runs.find(block, q, size);
+      for (int i = 0; joined && derivatives != nullptr && i < rows; ++i) stored[i] = runs.row(block, q, from, i);
+    }
     if (!joined) whole_rows ? read<true>() : read<false>();
   }
 
@@ -199,12 +202,12 @@ struct Nodes {
     return total;
   }
 
-  // The sums over all nodes, which a pull takes times what is given.
+  // The sums over all nodes, which a pull takes times what is given, and of stored rows alone: half the code.
   template <class Sums, class... Given>
   MPMJAX_INLINE auto sum(const Given&... given) const {
-    if constexpr (permutes) {
+    if constexpr (permutes && sizeof...(given) == 0) {
       if (joined) {
-        return sum_from<Sums>(0, [&](int i) MPMJAX_INLINE_LAMBDA { return runs.row(block, q, from, i); }, given...);
+        return sum_from<Sums>(0, [&](int i) MPMJAX_INLINE_LAMBDA { return runs.row(block, q, from, i); });
       }
     }
     return sum_from<Sums>(0, [&](int i) MPMJAX_INLINE_LAMBDA { return stored[i]; }, given...);

@@ -24,10 +24,7 @@ using mpmjax::Scatter;
 // Numbers from a first to before a last become zero, or of these only the blocks that are wanted.
 template <class T>
 void clear(T* numbers, const bool* wanted, int64_t first, int64_t last) {
-  if (wanted == nullptr) {
-    std::memset(numbers + first, 0, static_cast<size_t>(last - first) * sizeof(T));
-    return;
-  }
+  if (wanted == nullptr) return void(std::memset(numbers + first, 0, static_cast<size_t>(last - first) * sizeof(T)));
   for (int64_t end, i = first; i < last; i = end) {
     end = (i / kChunk + 1) * kChunk;
     end = end < last ? end : last;
@@ -59,11 +56,8 @@ MPMJAX_NOINLINE void stream(T* numbers, int64_t first, int64_t last) {
 // Zeros from a first to before a last of so many numbers, which nobody reads soon.
 template <class T>
 void wipe(T* numbers, int64_t size, int64_t first, int64_t last) {
-  if (size * static_cast<int64_t>(sizeof(T)) > mpmjax::kCached) {
-    stream(numbers, first, last);
-  } else {
-    clear(numbers, nullptr, first, last);
-  }
+  const bool large = size * static_cast<int64_t>(sizeof(T)) > mpmjax::kCached;
+  large ? stream(numbers, first, last) : clear(numbers, nullptr, first, last);
 }
 
 // The least and the largest of a block's numbers; min_element's search would take branches.
@@ -139,7 +133,7 @@ struct NodeSums {
     const int32_t node = block.node(row, q);
     if (inside || (block.contiguous[q] && holds_row(node))) {
       T* to = nodes + node * stride();
-      const R added = present.of(numbers);
+      const R added = (columns == 0 ? present : LaneMask<R>(columns)).of(numbers);
       // All is read before anything is written: a part's last lanes may be the next one's first, which writes them
       // last.
       const R sums = R::of([&](int k) MPMJAX_INLINE_LAMBDA {
@@ -147,8 +141,8 @@ struct NodeSums {
       });
       each<R::count>([&](int k) MPMJAX_INLINE_LAMBDA { store(to + k * R::together * stride(), sums.parts[k]); });
     } else {
-      const R apart = numbers;  // so that the numbers themselves need no place in memory
-      add_apart(block, row, q, apart);
+      const R apart = numbers;  // so that neither the numbers nor what is known of the nodes need a place in memory
+      NodeSums(*this).add_apart(block, row, q, apart);
     }
   }
 
@@ -220,6 +214,21 @@ struct Scatterer {
   }
 };
 
+// Adds the rows of a block's particles that are taken: a function of its own, for all sums of as many columns.
+template <class T, int d, int s, bool graded, int columns>
+MPMJAX_NOINLINE void add_rows(const Block<T, d, s>& block, const Vector<T> (*rows)[kRoom], const int* taken, int some,
+                              const NodeSums<T, s, columns>& to) {
+  const NodeSums<T, s, columns> nodes = to;  // which no store can change
+  for (int k = 0; k < some;) {
+    Scatterer<T, d, s, graded, columns> scatterer{block};
+    const int q = taken[k];
+    do {
+      scatterer.add(taken[k], rows);
+    } while (++k < some && block.same_nodes[taken[k]]);
+    nodes.holds(block, q) ? scatterer.template put<true>(nodes, q) : scatterer.template put<false>(nodes, q);
+  }
+}
+
 // The ranges of all blocks from a first to a last, and where there are so many nodes to mark, those that they reach.
 template <class T, int d, int s>
 void find_ranges(const Stencils<T>& stencils, int64_t first, int64_t last, Range* ranges, int64_t size, bool* reached) {
@@ -255,14 +264,7 @@ MPMJAX_INLINE void add_blocks(const Stencils<T>& stencils, const Range* ranges, 
       block.join_last();
       Vector<T> rows[graded ? d + 1 : 1][kRoom];
       give(block, start, count, rows);
-      for (int k = 0; k < some;) {
-        Scatterer<T, d, s, graded, columns> scatterer{block};
-        const int q = taken[k];
-        do {
-          scatterer.add(taken[k], rows);
-        } while (++k < some && block.same_nodes[taken[k]]);
-        nodes.holds(block, q) ? scatterer.template put<true>(nodes, q) : scatterer.template put<false>(nodes, q);
-      }
+      add_rows<T, d, s, graded, columns>(block, rows, taken, some, nodes);
     }
   }
 }
@@ -296,11 +298,8 @@ void add_all(const Scatter<T>& task, int64_t first, int64_t last) {
   if (graded && task.columns == d) return scatter_columns<T, d, s, true, d>(task, 0, first, last);
   if (graded && task.columns == d + 1) return scatter_columns<T, d, s, true, d + 1>(task, 0, first, last);
   for (int64_t c = 0; c < task.columns; c += kLanes) {
-    if (graded) {
-      scatter_columns<T, d, s, true, 0>(task, c, first, last);
-    } else {
-      scatter_columns<T, d, s, false, 0>(task, c, first, last);
-    }
+    graded ? scatter_columns<T, d, s, true, 0>(task, c, first, last)
+           : scatter_columns<T, d, s, false, 0>(task, c, first, last);
   }
 }
 
@@ -308,11 +307,8 @@ template <class T, int d, int s>
 void scatter(const Scatter<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns;
   over_reached(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
-    if (reached) {
-      clear(task.nodes, task.wanted, from * columns, to * columns);
-    } else {
-      wipe(task.nodes, task.size * columns, from * columns, to * columns);
-    }
+    reached ? clear(task.nodes, task.wanted, from * columns, to * columns)
+            : wipe(task.nodes, task.size * columns, from * columns, to * columns);
   });
   add_all<T, d, s>(task, first, last);
 }
