@@ -4,8 +4,7 @@ The reference is refined until it changes little or its time is up. If explicit 
 `stable_dt` of the whole motion, which resolves all that the grid does. Otherwise it uses TR-BDF2, and halves the step
 until that changes the motion by less than a third of the target error, or until the step is below the explicit limit.
 Then spacing and step are halved together: transfers act once a step, so on a given grid a smaller step alone need not
-improve the motion. The last change estimates the error of the reference run; the estimate is safe for convergence of
-first order or more.
+improve the motion. The last change estimates the error of the reference run, safely from the first order on.
 """
 
 import math
@@ -97,8 +96,7 @@ class Clock:
         return self._end - time.perf_counter()
 
     def allows(self, seconds: float) -> bool:
-        """Whether a run of compiled code that takes these seconds is allowed: it fits into the seconds left, or into a
-        twentieth of all."""
+        """Whether compiled code may run for so long: it fits into the seconds left, or into a twentieth of all."""
         return seconds <= max(self.left, self.seconds / 20)
 
 
@@ -185,8 +183,7 @@ def settle(
     )
 
     def refined(bench: Bench, steps: int) -> tuple[Trial, list[State] | None, Displacements | None]:
-        """A run, its error the change from the motion of the run before; its states and its motion, None if it
-        failed."""
+        """A run, its error the change from the motion of the run before; its states and motion, None if it failed."""
         states, _, seconds = bench.run(method, steps)
         motion = None if states is None else bench.motion(states)
         change = math.inf if motion is None or coarse is None else coarse.distance(motion)

@@ -1,5 +1,4 @@
-"""Mass, momentum and energy of a state, and their budgets for each step, with a term for every transfer, force and
-approximation."""
+"""Mass, momentum and energy of a state, and their budgets by transfer, force and approximation in each step."""
 
 import equinox as eqx
 import jax
@@ -164,8 +163,7 @@ class MomentumBudget(eqx.Module):
 
     change = gravity + body_force + boundary + friction + elastic + viscous + transfer.
 
-    The impulse of a symmetry plane is that of its mirror image, in `elastic` and `transfer`. Without such planes both
-    vanish.
+    The impulse of a symmetry plane is that of its mirror image, in `elastic` and `transfer`, which else vanish.
     """
 
     change: Float[Array, "*f d"]  # change of Σ m v

@@ -71,8 +71,7 @@ def sensitivity(
     Args:
         scene, particles, dt, method, start: as in `simulate`.
         t1: end time [s], a multiple of the step.
-        direction: the change δv0 of the initial velocities, of any size, shape (p, d). Default: normally distributed,
-            of variance 1/m_p.
+        direction: the change δv0 of the initial velocities, of any size, shape (p, d). Default: normal, variance 1/m_p.
         seed: of the default change.
         save_every: measure every so many steps, and at the end. Default: about a hundred times.
         warn_at: growth [-] from which a Python warning is given (under `jax.jit` and the like none is).

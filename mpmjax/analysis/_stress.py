@@ -46,8 +46,7 @@ def von_mises(scene: Scene, particles: Particles) -> ParticleScalar:
 
 @checked
 def density(scene: Scene, particles: Particles) -> ParticleScalar:
-    """The density m/(V0 J) of each particle [kg/m^d], shape (p,), of material without its gaps (see `stress`); zero of
-    particles without mass."""
+    """The density m/(V0 J) of each particle [kg/m^d], shape (p,), without gaps (see `stress`); zero without mass."""
     ratio = _stress_and_ratio(canonical(scene, particles.x.dtype), particles)[1]
     return particles.mass / (jnp.where(particles.volume > 0, particles.volume, 1) * ratio)
 

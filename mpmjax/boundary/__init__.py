@@ -20,11 +20,7 @@ from mpmjax.boundary._collider import (
     SlipCollider as SlipCollider,
     StickyCollider as StickyCollider,
 )
-from mpmjax.boundary._conditions import (
-    Conditions as Conditions,
-    FreeNormal as FreeNormal,
-    OwnedImpulse as OwnedImpulse,
-)
+from mpmjax.boundary._conditions import Conditions as Conditions, FreeNormal as FreeNormal, OwnedImpulse as OwnedImpulse
 from mpmjax.boundary._contact import (
     AbstractContact as AbstractContact,
     AbstractNodes as AbstractNodes,

@@ -145,10 +145,7 @@ def column_weight(wall: WallImage, mass: NodeScalar) -> Array:
 
 
 def plane_contact(
-    walls: tuple[WallImage, ...],
-    inward: tuple[Array | int, ...],
-    friction: Scalar | None,
-    around: Float[Array, "n s"],
+    walls: tuple[WallImage, ...], inward: tuple[Array | int, ...], friction: Scalar | None, around: Float[Array, "n s"]
 ) -> PlaneContact:
     """The contact of walls across an axis with the columns around particles whose gap is shut, where the weights of
     those have a sum, shape (n, s)."""

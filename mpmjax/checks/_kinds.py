@@ -85,8 +85,7 @@ def _hints(module: type) -> tuple[tuple[str, Any, bool, list[Any]], ...]:
 
 
 def require_kind(name: str, value: Any, hint: Any) -> None:
-    """Raise a `ValueError` if a value is of no kind that an annotation names, with these kinds, and which of them
-    may have been meant."""
+    """Raise a `ValueError` with the kinds that an annotation names if a value is of none, and what may be meant."""
     if not _takes(hint, value):
         shown = f"the class {value.__name__}" if isinstance(value, type) else shortened(repr(value))
         raise ValueError(f"{name} must be {_in_words(hint)}, got {shown}{_meant(hint, value)}")

@@ -75,8 +75,7 @@ def _modules(tree: Any) -> Iterator[Any]:
 
 
 def require(condition: Any, message: str) -> None:
-    """Raise `ValueError(message)` unless the condition holds everywhere. Traced conditions are put off
-    (`requirements`)."""
+    """Raise `ValueError(message)` unless the condition holds everywhere; traced ones wait for `requirements`."""
     if is_traced(condition):
         if (gathered := _put_off.get()) is not None:
             gathered.append(Requirement(message, lambda: condition))
@@ -118,8 +117,7 @@ def as_floats(value: Any) -> Any:
 
 
 def as_plain(value: Any) -> Any:
-    """A list or array as a tuple of Python's numbers, an array without axes as a number, so that it can fix a program;
-    all else as it is."""
+    """A list or array as a tuple of Python's numbers or as a number, which can fix a program; all else as it is."""
     if isinstance(value, (np.ndarray, np.generic, jax.Array)) and not is_traced(value):
         value = value.tolist()
     return tuple(value) if isinstance(value, list) else value
@@ -235,9 +233,8 @@ def canonical(tree: Any, dtype: Any) -> Any:
 
 
 def require_memory(what: str, needed: float | int, advice: str, *, device: bool = False) -> None:
-    """Raise a `ValueError` if what will be allocated, `needed` bytes at least, of jax's `device` or the host, does
-    not fit into the available memory. `what` is the subject of "takes at least so many GB", `advice` says which
-    number to change."""
+    """Raise a `ValueError` if `needed` bytes are more than the available memory of jax's `device` or the host. `what`
+    is the subject of "takes at least so many GB", `advice` says which number to change."""
     if needed < 2**26:  # asking takes longer
         return
     there = available_memory(device=device)
@@ -248,8 +245,7 @@ def require_memory(what: str, needed: float | int, advice: str, *, device: bool 
 
 
 def available_memory(*, device: bool = False) -> float | int:
-    """Memory that can be allocated [B]: of the host, within its control group's limit, or with `device` of jax's
-    device."""
+    """Memory that can be allocated [B]: of jax's `device`, or of the host within its control group's limit."""
     stats = jax.local_devices()[0].memory_stats() if device else None  # None of a CPU, whose memory is the host's
     if stats and "bytes_limit" in stats:
         return stats["bytes_limit"] - stats.get("bytes_in_use", 0)

@@ -19,16 +19,7 @@ from mpmjax.analysis import METHODS, Trial, energy, grid_mass, name_of, pieces, 
 from mpmjax.checks import require, warn
 from mpmjax.cli._fit_file import FitFile, read_fit, refinements
 from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
-from mpmjax.fitting import (
-    Experiment,
-    FitProblem,
-    Profile,
-    fit,
-    fit_refined,
-    fit_staged,
-    predict_observations,
-    profile,
-)
+from mpmjax.fitting import Experiment, FitProblem, Profile, fit, fit_refined, fit_staged, predict_observations, profile
 from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, replacing, reporting, standing_in, stopping, table
 from mpmjax.native import BACKENDS, backend
 from mpmjax.simulation import Problem, Run, SimulationError, initial_state, no_steps, run_to
@@ -159,8 +150,7 @@ def _bytes(size: int | float) -> str:
 
 
 def _summary(start: Particles, run: Run, taken: int = 0, seconds: float = 0.0) -> str:
-    """The cost of a run from its first particles on, if `taken` of its steps were done in these seconds, and how well
-    it kept mass and energy."""
+    """The cost of `taken` steps of a run in these seconds, if any, and how well it kept mass and energy."""
     s, p, steps = run.statistics, run.final.count, max(int(run.statistics.steps), 1)
     before, after = energy(run.scene, start), energy(run.scene, run.final)
     whole, parts = pieces(run.scene, start), pieces(run.scene, run.final)
@@ -270,8 +260,7 @@ def fit_scene(
 
 
 def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> FitFile:
-    """The fit, started where a fit to growing horizons ended, if the file asks for these, to the data that they
-    reach."""
+    """The fit, started where a fit to growing horizons ended if the file asks for these, to the data they reach."""
     if not asked.horizons:
         return asked
     times = None if asked.horizons is True else asked.horizons

@@ -1,5 +1,4 @@
-"""The `[fit]` table of a scene file: what is fitted, and what was measured. `docs/scene_files.md` is the schema in
-words."""
+"""The `[fit]` table of a scene file (docs/scene_files.md): what is fitted, and what was measured."""
 
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -197,8 +196,7 @@ def fit_parameter(
     """Name and parameter of a [[fit.parameter]] table, of these experiments."""
     where = f"[[fit.parameter]] {path or kind!r}"
     require(
-        kind in ("Positive", "Bounded", "Unbounded", *_OF_THE_BODY),
-        f"{where}: there is no kind of parameter {kind!r}.",
+        kind in ("Positive", "Bounded", "Unbounded", *_OF_THE_BODY), f"{where}: there is no kind of parameter {kind!r}."
     )
     numbers = (0,) if only is None else only
     there = len(numbers) > 0 and all(0 <= k < len(experiments) for k in numbers)

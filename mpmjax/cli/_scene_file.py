@@ -1,5 +1,4 @@
-"""Scene files: TOML in, a scene with its particles and run settings out. `docs/scene_files.md` is the schema in
-words."""
+"""Scene files (docs/scene_files.md): TOML in, a scene with its particles and run settings out."""
 
 import itertools
 import os
@@ -94,16 +93,14 @@ def load_scene(path: str | os.PathLike) -> tuple[Scene, Particles, dict[str, Any
     that on. "stable" and "auto" are resolved as there, the latter by pilot runs.
 
     Raises:
-        ValueError: a file that is missing or not TOML; a key that is unknown, missing or unfit: one line with its
-            place.
+        ValueError: a file that is missing or not TOML; an unknown, missing or unfit key: one line with its place.
     """
     simulation = read_simulation(Path(path))
     return simulation.scene, simulation.particles, simulation.settings
 
 
 def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
-    """Read a scene file after changes to it (see `scene_table`); a ValueError says in one line which key is unknown,
-    missing or unfit, and where."""
+    """Read a scene file after changes to it (see `scene_table`); a ValueError says in one line what is wrong where."""
     from mpmjax_command import scene_table  # here, since it imports the shell's parser
 
     table = scene_table(path, changes)
@@ -201,8 +198,7 @@ def stable_step(path: Path, file: SceneFile) -> float:
 
 
 def particles_in(file: str, frame: int = -1) -> Particles:
-    """The particles of a frame in a run's file, with all of their state: frames count from 0, from the end if
-    negative."""
+    """The particles, with all of their state, of a frame in a run's file, from 0, or from the end if negative."""
     return load(file, frame=frame).final
 
 

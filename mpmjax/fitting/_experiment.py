@@ -177,8 +177,7 @@ class AbstractObservation(eqx.Module):
         return float(np.ptp(data) or np.abs(data).max() or 1.0)
 
     def residuals(self, predicted: Array, sigma: Scalar | Array) -> Array:
-        """√weight (predicted − data)/σ [-], in C order, shape (m,), by `drawn_nearer` if robust; zero where nothing was
-        measured."""
+        """√weight (predicted − data)/σ [-], shape (m,), by `drawn_nearer` if robust; zero where data are missing."""
         require(
             predicted.shape == self.data.shape,
             f"{self.title} has data of shape {self.data.shape}, what the simulation says has shape {predicted.shape}.",

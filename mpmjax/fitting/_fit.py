@@ -68,8 +68,7 @@ def fit(
 
     The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched, with
     derivatives through every step and every implicit solve. A step at which a simulation fails is not taken. A σ that
-    is not given is estimated: as √(Σ r²/(m − n)) of one observation, and of several so that each explains its own
-    misfit, in rounds.
+    is not given is estimated: as √(Σ r²/(m − n)), of several observations in rounds, each by its own misfit.
 
     Where the misfit is beyond the noise, or residuals have a shape, other starts are tried (`starts`), and errors and
     intervals hold it, those of the noise alone beside them (docs/fitting.md#intervals-that-hold). None of it sees what
@@ -214,8 +213,7 @@ def _in_rounds(
 
 
 def require_end(end: Search) -> None:
-    """Raise a `KeyboardInterrupt` if a search was interrupted, a `RuntimeError` if it failed for want of a
-    derivative."""
+    """Raise a `KeyboardInterrupt` of an interrupted search, a `RuntimeError` of one without a derivative."""
     if end.interrupted:
         raise KeyboardInterrupt
     if end.failure == NO_DERIVATIVE:

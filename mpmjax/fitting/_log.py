@@ -1,8 +1,7 @@
 """The record of a fit while it runs: lines of progress, and a log from which it continues bit for bit.
 
 The log is an HDF5 file, whose layout is in docs/fitting.md. It is replaced as a whole after each iteration (see
-`mpmjax.io.ReplacedFile`): it holds whole iterations only, however the process ends. Its last four bytes are CRC-32 of
-all others.
+`mpmjax.io.ReplacedFile`): it holds whole iterations only, however the process ends. Its last four bytes are its CRC-32.
 """
 
 import enum
@@ -287,8 +286,7 @@ def _lines(
 
 
 def iterations_left(distances: list[float]) -> int | None:
-    """How many iterations the distance needs to fall to one, at the mean rate of its last three values; None where it
-    does not fall, or is not known."""
+    """Iterations until the distance is one, at the mean rate of the last three; None where it does not fall."""
     last = np.asarray(distances[-3:])
     if len(last) < 3 or not (np.isfinite(last).all() and 0 < last[-1] < last[0]):
         return None

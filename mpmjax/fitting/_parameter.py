@@ -310,8 +310,7 @@ class Bounded(_PlainParameter):
 
 
 class Field(AbstractParameter):
-    """A parameter that changes from place to place: its values on the nodes of a lattice, interpolated to the particles
-    where they start.
+    """A parameter that changes from place to place: values on a lattice, interpolated to the particles as they start.
 
         stiffness = mpm.Positive(lambda e: e.scene.material.youngs_modulus, prior=mpm.fitting.Smooth(0.5), unit="Pa")
         result = mpm.fit(pull, {"E": mpm.fitting.Field(stiffness, mpm.fitting.Field.lattice_around(particles, 0.1))})

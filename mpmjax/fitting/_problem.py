@@ -198,8 +198,7 @@ class FitProblem(eqx.Module):
         return tuple(self.put(experiment, z, number) for number, experiment in enumerate(self.experiments))
 
     def put(self, experiment: Experiment, z: Coordinates, number: int | None) -> Experiment:
-        """Any experiment with these values: the parameters of the experiment of a number, or with None those that
-        belong to all experiments."""
+        """An experiment with the parameters of the experiment of a number, or of all experiments with None."""
         before = experiment.particles
         for parameter, value in zip(self.parameters, self.values(z), strict=True):
             if parameter.only is None or number in parameter.only:

@@ -89,8 +89,7 @@ class Markers(eqx.Module):
 
 
 class Extent(eqx.Module):
-    """How far the particles that have mass reach: a front, or a height [m]; its derivative is that of the farthest
-    one."""
+    """How far particles with mass reach: a front or height [m], whose derivative is that of the farthest one."""
 
     axis: int = eqx.field(static=True)  # the direction
     side: Literal["upper", "lower"] = eqx.field(static=True, default="upper")

@@ -49,8 +49,7 @@ class AbstractOptimiser(eqx.Module):
         self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: Any
     ) -> tuple[Coordinates, Any, Evaluation]:
         """One iteration from the state that `begin` or the last iteration returned: where it is now, the state, and
-        what it knows of that place. The first one evaluates where it starts. A step at which a simulation fails must
-        not be taken."""
+        what it knows of that place. The first one evaluates where it starts. No step may end where simulations fail."""
 
     @abc.abstractmethod
     def has_converged(self, state: Any, seen: Evaluation) -> bool:
@@ -133,8 +132,7 @@ def search_many(
         joining: a search that comes so near to another one of one problem with a lower cost, in each coordinate, is
             ended: it would go the same way. Zero ends none.
         settling: a search is at a minimum too where its last three moves, or six iterations, lowered the cost by less
-            than this part of it: Gauss-Newton steps are slow where residuals are large, as at false minima. Zero ends
-            none.
+            than this part of it: Gauss-Newton steps are slow where residuals are large. Zero ends none.
         state: in the place of its start, an earlier state of the first search, which is continued exactly.
         done: earlier searches, by their numbers, which are returned with the others.
         enough: says of each search that has ended whether those that wait need not begin; they are left out.

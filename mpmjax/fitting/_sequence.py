@@ -229,8 +229,7 @@ def fit_refined(
     the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and that whole correction is taken as the standard
     error that is left of the discretisation. p is `order`; with three grids of equal ratios it is what they show,
     between half and twice that, but the error is no less than by `order`, for grids may be too coarse to tell. Where
-    the estimates do not converge, or one lies at its bound, the finest stays, with its last change as the error, and a
-    warning says so.
+    the estimates do not converge, or one is at its bound, the finest stays, its last change the error, with a warning.
 
     Two estimates may agree by chance and both be wrong. What the finest grid misses of the data then tells more: D, in
     units of σ. A discretisation that changes predictions by D in ways that no parameter can follow may do as much in

@@ -34,8 +34,7 @@ class Starts(eqx.Module):
 
     A search that comes within a hundredth, in each coordinate, of another with a lower cost is ended, and counted where
     that one ends; one whose sum of squares three moves, or six iterations, have lowered by less than a hundredth is
-    ended as at a minimum. Those within twice the least sum of squares are searched on, and the best is then fitted as
-    from a single start.
+    ended as at a minimum. Those within twice the least sum of squares are searched on, and the best is then fitted.
 
     Two searches ended at one minimum where their coordinates differ by less than two hundredths, or the misfit hides
     the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, with J and s² = Σ r²/(m − n) of the better one, s² at least one
@@ -47,16 +46,14 @@ class Starts(eqx.Module):
             without a look; 0 only from those of single linkage and the first guess.
         ranges: lowest and highest value to start from, by the name of a parameter. Default: its prior, or its bounds,
             from a tenth to ten times the first guess of a `Positive`, one coordinate each way of an `Unbounded` one.
-        points: values by the names of parameters from which a search starts whatever is near; the first guess of those
-            that are not named.
+        points: values by the names of parameters, others at the first guess, from which a search starts in any case.
         if_needed: look at them only where the misfit of the fit from the first guess is beyond the noise; searches then
             run one by one, the best points first, until the misfit of one is within the noise.
         seed: of the Sobol points.
         batch: how many points, and searches, run together. Default: eight with explicit steps, one with implicit ones.
 
     Raises:
-        ValueError: no point; a fraction beyond 0 to 1. `fit` refuses ranges and points of no parameter, or outside of
-            its bounds.
+        ValueError: no point; a fraction beyond 0 to 1. `fit` refuses ranges and points beyond bounds.
     """
 
     count: Annotated[int, whole(1)] = 64

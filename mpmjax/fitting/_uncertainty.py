@@ -8,8 +8,7 @@ import numpy as np
 from mpmjax.checks import warn
 
 _ROUNDINGS = 1e3
-"""Singular values of J, its columns of length one, below this many roundings of the largest are none: the data do not
-see the direction."""
+"""Singular values of J, its columns of length one, below so many roundings of the largest are of unseen directions."""
 _SHARE = 1e-6  # part of a unit vector below which it does not lie in a direction
 _LEAST_FREEDOM = 1e-3  # degrees of freedom below which there are none, but rounding
 _AT_BOUND = 1e-2  # standard errors from a bound at which a number lies at it
@@ -24,8 +23,7 @@ class Uncertainty(NamedTuple):
     """The covariance of n coordinates at a minimum, by the Gauss-Newton Hessian."""
 
     inverse: np.ndarray
-    """The covariance, but in directions that the data do not see, shape (n, n); of noise alone the pseudo-inverse of
-    JᵀJ."""
+    """The covariance [-] but in directions that the data do not see, shape (n, n); of noise alone (JᵀJ)⁺."""
     unseen: np.ndarray  # directions that the data do not see, one a column, shape (n, u)
     weak: np.ndarray
     """Directions that the data hardly see, a tenth as well as each coordinate alone, one a column, shape (n, w)."""
@@ -232,12 +230,7 @@ class Prediction(NamedTuple):
 
 
 def banded(
-    errors: Uncertainty,
-    level: float,
-    value: Any,
-    J: Any,
-    sigma: np.ndarray | None = None,
-    number: int | None = None,
+    errors: Uncertainty, level: float, value: Any, J: Any, sigma: np.ndarray | None = None, number: int | None = None
 ) -> Prediction:
     """Values with their bands, by their derivative J, shape (..., n). `sigma` is the noise of new measurements, if that
     is known, `number` that of their observation, if they are of one."""

@@ -34,13 +34,7 @@ from mpmjax.io._run_file import (
     states_in,
 )
 from mpmjax.io._transactional_file import StagedFile, reason, replacing, undisturbed
-from mpmjax.simulation import (
-    Problem,
-    RolloutState,
-    RunStatistics,
-    initial_state,
-    no_steps,
-)
+from mpmjax.simulation import Problem, RolloutState, RunStatistics, initial_state, no_steps
 from mpmjax.state import with_state
 
 FIELDS_WRITTEN = ("pressure", "von_mises", "material")  # the fields that a file has unless it is asked for others
@@ -141,8 +135,7 @@ class FrameWriter:
         return int(steps[0]), *at((states, tallies), 0)
 
     def standing(self, then: str) -> str:
-        """A sentence on what the file holds, and then what to do. It reads nothing, so that any thread may call it at
-        any time."""
+        """A sentence on what the file holds, and then what to do. Any thread may call it: it reads no file."""
         if not self._staged.is_at(self._path):
             return f"{self._path} was removed or replaced while it was written: run the simulation again."
         frames, step, time = self._kept
@@ -190,8 +183,7 @@ def new_writer(path: Path, run: Problem, begin: RolloutState, fields: Sequence[s
 
 
 def at(tree: Any, index: int | slice) -> Any:
-    """The entries of arrays along their first axis. NumPy takes them: each operation of JAX by itself is a program to
-    compile."""
+    """Entries of arrays along their first axis, by NumPy: each operation of JAX would be a program to compile."""
     return jax.tree.map(lambda a: jax.device_put(np.asarray(a)[index]), tree)
 
 
@@ -230,8 +222,7 @@ def _rows(
 
 
 def frames_in(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.ndarray, RolloutState, RunStatistics]:
-    """Step numbers, states and statistics of frames `start` to `stop`, each with a leading axis; of `like` only shapes
-    count."""
+    """Step numbers, states and statistics of frames, each with a leading axis; of `like` only shapes count."""
     rows = frame_rows(file, start, stop)
     table = rows["mpmjax/frames"]
     tallies = RunStatistics(**jax.device_put({f.name: table[f.name] for f in columns(RunStatistics)}))

@@ -22,8 +22,7 @@ def table_schema(function: Callable, without: Iterable[str] = (), kind: str | No
 
 
 def class_schemas(*bases: type) -> dict[str, Any]:
-    """The JSON schema of each class that files can hold, of those of further base classes, and of what else has a
-    kind, by name."""
+    """The JSON schemas, by name, of all classes that files can hold, of further bases, and of what is `MADE`."""
     classes = {c.__name__: c for c in (*known_classes(), *classes_for(bases))}
     made = {name: make for name, (make, _) in MADE.items()}
     return {name: table_schema(c, kind=name) for name, c in (classes | made).items()}

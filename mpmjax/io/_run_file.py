@@ -72,8 +72,7 @@ def set_count(file: File, count: int) -> None:
 
 
 def check_place(path: Path, *, overwrite: bool) -> None:
-    """Raise `ValueError` if a new file cannot be there: no folder, a file that is there, and with `overwrite` one that
-    is no run or is being written."""
+    """Raise `ValueError` if no new file can be there; with `overwrite`, if what is there is no run or being written."""
     if not path.exists():
         require(path.parent.is_dir(), f"{path} cannot be written (no folder {path.parent}): name a place that can be.")
         return
@@ -197,8 +196,7 @@ def _fixed_checksum(file: File) -> int:
 
 
 def frame_rows(file: File, start: int, stop: int) -> dict[str, np.ndarray]:
-    """The rows of frames `start` to `stop` in each dataset that grows; a ValueError if they are not what was
-    written."""
+    """The rows of some frames in each dataset that grows; a ValueError if they are not what was written."""
     rows = {}
     for name, item in _datasets(file, growing=True).items():
         count = (item.chunks or (0,))[0]

@@ -45,13 +45,7 @@ from mpmjax.checks import (
     warn,
 )
 from mpmjax.io._frame_writer import FIELDS_WRITTEN, FrameWriter, at, check_fields, frames_in, new_writer
-from mpmjax.io._run_file import (
-    check_place,
-    count_in,
-    description_in,
-    reading,
-    require_of_file,
-)
+from mpmjax.io._run_file import check_place, count_in, description_in, reading, require_of_file
 from mpmjax.io._schema import decode
 from mpmjax.io._transactional_file import reporting
 from mpmjax.simulation import (
@@ -96,8 +90,7 @@ def record(
     """Simulate as `simulate` does, writing each frame to a file when it is reached; memory holds one frame only.
 
     The steps between two frames are one compiled program, called again and again, and give the same numbers as
-    `simulate` with the same `save_every`, bit for bit on a CPU. A run that is interrupted or meets a fault leaves a
-    whole file.
+    `simulate` with the same `save_every`, bit for bit on a CPU. An interruption or a fault leaves a whole file.
 
     Args:
         path: the file to be (see `save`).
@@ -222,8 +215,7 @@ def save(path: str | os.PathLike, run: Run, *, fields: tuple[str, ...] | list[st
 
 
 def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
-    """Check that the step is positive, step numbers grow, states are finite, and positions are ones that a grid can
-    number."""
+    """Check that dt is positive, step numbers grow, states are finite, and a grid can number the positions."""
     require_positive("dt [s]", dt)
     require(steps[0] >= 0 and (np.diff(steps) > 0).all(), f"A run's steps must grow from 0 or later, got {steps}.")
     most = float(scene.grid.spacing) * 2**31  # as far as nodes are numbered
@@ -246,8 +238,7 @@ def load(path: str | os.PathLike, *, frame: int | None = None) -> Run:
 
     Args:
         path: the file.
-        frame: number of the only frame to read, which the run then ends with; counts from the end if negative.
-            Default: all.
+        frame: number of the only frame to read, from the end if negative, with which the run ends. Default: all.
 
     Raises:
         ValueError: a frame that is not there; a file that is missing, cut short or damaged, not of this package or of

@@ -257,8 +257,7 @@ def _network_data(network: Any, arrays: dict[str, np.ndarray] | None, path: str)
 
 
 def _network(data: dict[str, Any], options: list[Any], where: str, arrays: dict[str, np.ndarray] | None) -> Any:
-    """The module of `equinox.nn` that `_network_data` describes, without a call of its constructor, which takes sizes
-    and a key for random weights."""
+    """The module of `equinox.nn` that `_network_data` describes, without its constructor, which draws weights."""
 
     def part(data: Any) -> Any:
         if isinstance(data, list):
@@ -292,8 +291,7 @@ def _usual_functions(network: type) -> dict[str, Callable]:
 def arguments(
     function: Callable, table: Any, where: str, arrays: dict[str, np.ndarray] | None = None, without: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """The keyword arguments of a function (or class) that a table describes (see `decode`), `without` those that it
-    has otherwise."""
+    """The keyword arguments of a function or class that a table describes (see `decode`), some left out."""
     _require(isinstance(table, dict), where, f"must be a table, got {_short(table)}")
     parameters = {name: p for name, p in parameters_of(function).items() if name not in without}
     require_keys(table, parameters, where)

@@ -3,8 +3,7 @@
 `replacing` writes a new file aside and puts it in its place. A `StagedFile` changes by commits: all of what was written
 since the last one, or nothing; and one writer at a time. HDF5 writes as it sees fit, also while it closes, and what a
 full disk refuses then is lost in silence. So it writes to memory, and a commit puts that on the disk: what lengthens
-the file first, since this is where room runs out, then what lies within it. If the disk refuses, the file is made what
-it was.
+the file first, since this is where room runs out, then what lies within it. If the disk refuses, it is made as it was.
 
 On Ctrl-C and SIGTERM a command of the shell ends at once, between two writes, and says where its files stand. Python's
 own way is an exception in the main thread, which waits until compiled code returns, and then comes anywhere: amid a
@@ -160,8 +159,7 @@ class StagedFile(io.RawIOBase):
     it drops what was not committed."""
 
     def __init__(self, path: Path):
-        """Open a file and lock it for writing; `ValueError`s say why not. The lock goes with the process, however that
-        ends; readers are free."""
+        """Open a file and lock it for writing while the process lives; `ValueError`s say why not. Readers are free."""
         try:
             self._raw = open(path, "r+b", buffering=0)  # noqa: SIM115 (closed by `close`)
             try:
@@ -214,8 +212,7 @@ class StagedFile(io.RawIOBase):
         return size
 
     def commit(self) -> None:
-        """Bring the file up to date. If the disk refuses, an OSError: the file is what it was, and what was staged
-        is lost."""
+        """Bring the file up to date; an OSError if the disk refuses: the file is as it was, what was staged is lost."""
         with undisturbed():
             size, grown = self._size, bytearray(max(0, self._length - self._size))
             self.seek(size)
@@ -249,8 +246,7 @@ class StagedFile(io.RawIOBase):
         os.fsync(self._raw.fileno())
 
     def close(self) -> None:
-        """Close the file, without what was not committed. For HDF5, which may still write as it is collected, for
-        nothing, it stays open."""
+        """Close the file, without what was not committed. HDF5 may still write to the object, for nothing."""
         self._raw.close()
 
     def _stored(self, at: int, size: int) -> bytes:
@@ -307,20 +303,17 @@ def _lock(file: int, *, shared: bool) -> None:
 
 
 class ReplacedFile:
-    """A file that holds all of its last `write`, at every moment, however the process ends. A context manager: leaving
-    it gives up the lock."""
+    """A file that holds all of its last `write` at every moment. A context manager: leaving it unlocks the file."""
 
     def __init__(self, path: Path, *, new: bool):
-        """Take the lock of a file that is there; with `new`, of one that the first `write` makes. A ValueError says
-        why it cannot."""
+        """Lock a file that is there, or with `new` the one that the first `write` makes; a ValueError says why not."""
         if new:
             require(not path.exists(), f"{path} exists: choose another name, remove it, or ask to resume it.")
             require(path.resolve().parent.is_dir(), f"{path} cannot be written (no folder {path.parent}).")
         self._path, self._lock = path, None if new else _locked(path)
 
     def write(self, data: bytes) -> None:
-        """Replace what the file holds. If the disk refuses, or another file has the name, an OSError: that is what
-        it was."""
+        """Replace what the file holds; an OSError, and no change, if the disk refuses or another file has the name."""
         if self._lock is not None and self._path.exists() and not self._lock.is_at(self._path):
             raise OSError(f"{self._path} was replaced by another file while it was written: choose another name.")
         with undisturbed():

@@ -294,8 +294,7 @@ def checkpointed(
 ) -> diffrax.AbstractAdjoint:
     """The adjoint for reverse mode that computes steps again as seldom as a `budget` of memory allows [B]: by
     segments, in up to four loops; with less memory, or where a fault `stops` the run, diffrax's, whose checkpoints
-    move. A state takes `state_bytes`, what is stored of a step at once `step_bytes`, with the state that it starts
-    from."""
+    move. A state takes `state_bytes`, what is stored of a step at once, its state included, `step_bytes`."""
     for loops in () if stops else range(1, _MOST_LOOPS + 1):
         *outer, inner = _lengths(steps, loops)
         if sum(outer) * state_bytes + inner * step_bytes <= budget:

@@ -21,8 +21,7 @@ from mpmjax.stepping import SAFETY, AbstractIntegrator, UnknownBoundError, longe
 
 
 def raise_faults(run: Run, problem: Problem, before: Callable[[], RolloutState], start: int) -> None:
-    """Raise the faults in the statistics of an untraced run of a problem that began at step `start`; `before` gives the
-    state before the last step."""
+    """Raise the faults of an untraced run that began at step `start`; `before` gives the last step's first state."""
     fault = Fault(int(run.statistics.fault))
     if fault != Fault.NONE:
         previous = before()

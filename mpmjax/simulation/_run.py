@@ -11,6 +11,7 @@ import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.boundary import Impulses
+from mpmjax.checks import require
 from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import AbstractIntegrator, StepInfo
 
@@ -51,8 +52,7 @@ class RunStatistics(eqx.Module):
     fault: Int[Array, "*f"]  # the first `Fault`
     fault_step: Int[Array, "*f"]  # number of steps that led to it
     unmet: Int[Array, "*f"]
-    """With BAD_PARAMETERS the number, from one, of the first of the `requirements` on scene, particles and method that
-    is not met; else zero."""
+    """With BAD_PARAMETERS the number, from one, of the first of the `requirements` that is not met; else zero."""
 
     @property
     def linearisation_error(self) -> Float[Array, "*f"]:
@@ -121,8 +121,7 @@ class SimulationError(RuntimeError):
 
 
 class Forces(NamedTuple):
-    """Mean forces and torques on k colliders or boundaries over the steps between one saved frame and the next, of f
-    frames."""
+    """Mean forces and torques on k colliders or boundaries between one saved frame and the next, of f frames."""
 
     times: Float[Array, "g"]
     """The mean of the times of the steps' forces [s], shape (f − 1,): t_n + θΔt, with θ the method's `force_at`. It is
@@ -185,34 +184,25 @@ class Run(eqx.Module):
         return with_state(self.final, _row(self.frames, i % len(self)))
 
     def forces(self) -> Forces:
-        """The mean force and torque on each collider over the steps between one saved frame and the next.
-
-        Raises:
-            ValueError: nothing was saved on the way, or the scene has no collider.
-        """
-        if self.collider_impulse is None:
-            raise ValueError(
-                "Forces need saved frames and colliders: pass save_every to simulate, a collider to Scene."
-            )
+        """The mean force and torque on each collider over the steps between one saved frame and the next; a ValueError
+        if nothing was saved on the way, or the scene has no collider."""
+        need = "Forces need saved frames and colliders: pass save_every to simulate, a collider to Scene."
+        require(self.collider_impulse is not None, need)
         return self._mean_forces(self.collider_impulse)
 
     def boundary_forces(self) -> Forces:
         """The mean force and torque of the material on each of the scene's boundaries (walls, planes, grips and
         colliders, in their order) and then on the guides of each `Rigid` body that has some, over the steps between one
-        saved frame and the next.
-
-        Raises:
-            ValueError: nothing was saved on the way, or the scene does not have `boundary_forces`.
-        """
-        if self.boundary_impulse is None:
-            raise ValueError(
-                "Forces on boundaries need saved frames and a scene that computes them: pass save_every to simulate, "
-                "boundary_forces=True to Scene."
-            )
+        saved frame and the next; a ValueError if nothing was saved, or the scene does not have `boundary_forces`."""
+        require(
+            self.boundary_impulse is not None,
+            "Forces on boundaries need saved frames and a scene that computes them: pass save_every to simulate, "
+            "boundary_forces=True to Scene.",
+        )
         return self._mean_forces(self.boundary_impulse)
 
     @eqx.filter_jit
-    def _mean_forces(self, impulses: Impulses) -> Forces:
+    def _mean_forces(self, impulses: Impulses | None) -> Forces:
         times, at = self.times, self.method.force_at()
         between = (times[1:] - times[:-1])[:, None, None]
         mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between, impulses)

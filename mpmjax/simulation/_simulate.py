@@ -81,14 +81,12 @@ def simulate(
             memory than its points. `save_every` then defaults to 1. It may be an `equinox.Module` with arrays; a plain
             function compiles anew unless it is the same object.
         start: number of the first step, e.g. a former run's `final_step`; time there is start·dt. The impulse on
-            colliders and boundaries (`run.collider_impulse`) is summed from here on, also in a run that continues
-            another.
+            colliders and boundaries (`run.collider_impulse`) is summed from here on in any run.
         adjoint: how diffrax differentiates. Default: reverse mode by segments of steps.
         checkpoint_bytes: memory for what reverse mode stores by default [B]. With less of it steps are computed again,
             once if it is enough for the square root of their number.
         progress: show diffrax's progress meter.
-        throw: raise on faults. With False the result says them in `statistics`, and a batch member that fails leaves
-            the others alone.
+        throw: raise on faults. False puts them into `statistics`, and a failed batch member leaves others alone.
         control: a pure function `(scene, particles, t, dt, memory) -> (scene, particles, memory)`, called before each
             step: the scene that it returns has other numbers in this step (accelerations, motions of boundaries), the
             particles that it returns go on from there (activations, particles that enter or leave), and so does the
@@ -96,8 +94,7 @@ def simulate(
         memory: the control's memory at the start, a pytree of floats; e.g. a former run's `final_memory`.
 
     Raises:
-        ValueError: of `prepare`; a value of the method that it does not allow; a t1 that is not a whole number of steps
-            after the start.
+        ValueError: of `prepare`; a value of the method that it does not allow; a t1 not whole steps after the start.
         SimulationError: a state that is not finite, a particle outside the window, an F that the law does not allow,
             a particle that has collapsed (a stretch below a hundredth, in the updated description) or that passed a
             boundary (each with step, time and first bad particle; the last good state is in its `run.final`, for which
@@ -210,8 +207,7 @@ def _rollout(problem: Problem, steps: int) -> Particles:
 
 
 def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
-    """How many steps of dt lead from step `start` to time t1; a ValueError if that is no whole number, none, or more
-    than the precision can count."""
+    """Steps of dt from step `start` to time t1; a ValueError if no whole number, none, or too many for the dtype."""
     if is_traced((t1, dt)):
         raise ValueError("t1 and dt fix the number of steps and must be known numbers, not traced ones.")
     require_positive("dt [s]", dt, dtype)

@@ -126,8 +126,7 @@ def resorted(
 
 
 def _in_order(wanted: Bool[Array, ""], order: Order, state: State) -> State:
-    """A state with its particles in another order, in which those of a material stay among themselves, where that is
-    wanted."""
+    """A state with the particles of each material in another order, where that is wanted."""
     groups = [_moved(wanted, order[rows] - rows.start, (F, history)) for rows, F, history in by_material(state)]
     deformations, histories = zip(*groups, strict=True)
     x, v, C = _moved(wanted, order, (state.x, state.v, state.C))

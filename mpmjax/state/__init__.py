@@ -7,10 +7,7 @@ from mpmjax.state._attachment import (
     Patch as Patch,
     PointsAt as PointsAt,
 )
-from mpmjax.state._constraint import (
-    AbstractConstraint as AbstractConstraint,
-    AbstractLayerImage as AbstractLayerImage,
-)
+from mpmjax.state._constraint import AbstractConstraint as AbstractConstraint, AbstractLayerImage as AbstractLayerImage
 from mpmjax.state._fill import fill as fill, fill_mapped as fill_mapped
 from mpmjax.state._loads import (
     AbstractBodyForce as AbstractBodyForce,

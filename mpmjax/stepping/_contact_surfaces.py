@@ -5,15 +5,7 @@ from itertools import combinations
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Scalar, components
-from mpmjax.boundary import (
-    EXPLICIT_STIFFNESS,
-    IMPLICIT_STIFFNESS,
-    Body,
-    BodyContact,
-    Faces,
-    FaceShape,
-    body_contact,
-)
+from mpmjax.boundary import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Body, BodyContact, Faces, FaceShape, body_contact
 from mpmjax.discretisation import scatter
 from mpmjax.implicit import ElasticPotential
 from mpmjax.potential import Mirror

@@ -117,12 +117,7 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             adjoint, slot = adjoint.solver, adjoint.slot
         return solve(problem, slot, *without_derivative((guess, self.solved_by(), adjoint)))
 
-    def elastic_impulse(
-        self,
-        nodes: Nodes,
-        motion: NodeMotion,
-        stages: Stages | None = None,
-    ) -> NodeVector:
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion, stages: Stages | None = None) -> NodeVector:
         """Δt Σ q f(u) [kg m/s] of the motion's stages or of others, with the forces that the solution takes."""
         stages = self.stages(nodes, motion) if stages is None else stages
         if not self.linearises:

@@ -52,8 +52,7 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, fps: int) -> None:
 
 
 def disks(size: tuple[int, int], place: np.ndarray, radius: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """A picture (h, w, 4) of disks, the later ones over the earlier ones, with smooth edges: it is drawn twice as
-    large.
+    """A picture (h, w, 4) of disks, the later ones over the earlier ones, with smooth edges, by twice the size.
 
     Args:
         size: w and h [pixels].

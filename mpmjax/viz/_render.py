@@ -50,8 +50,7 @@ def render(
     sorted by depth, half as large again, so that they close into a body, and shaded by its surface in a light from the
     upper left; up is against gravity's largest component (the last axis without gravity), and the ground is the highest
     wall or plane that bears, else a little below the particles. All frames of a run have the same view and scale.
-    Colours go from the 1st to the 99th percentile of all values shown, and the bar's label says so where a value lies
-    beyond.
+    Colours go from the 1st to the 99th percentile of all values shown, as the bar's label says where some lie beyond.
 
     Args:
         run: a run with frames.
