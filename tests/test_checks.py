@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ import pytest
 from helpers import ELASTIC, FLUIDS, METHODS, PLASTIC, RUBBER, SECOND_ORDER, VISCOUS, block, ids
 
 import mpmjax as mpm
+from mpmjax.checks import between, checked, finite, positive, require_fields, whole
 from mpmjax.checks._values import canonical, first_unmet, requirements
 from mpmjax.material._fluid import Tait
 
@@ -203,3 +205,48 @@ def test_what_lies_beyond_a_plane_is_told_of_the_plane():
 def test_names_of_materials_are_one_for_each(names):
     with pytest.raises(ValueError, match="one for each of the scene's 1 materials and differ"):
         mpm.Scene(mpm.Grid((8, 8), 0.1), mpm.NeoHookean(1e4, 0.3), names=names)
+
+
+class Marked(eqx.Module):
+    """Fields with each mark, alone, in a union and on a tuple."""
+
+    modulus: Annotated[float | jax.Array, positive, "Pa"] = 1.0
+    share: Annotated[float, between(0, 1, open_ends=True)] | None = None
+    count: Annotated[int, whole(2)] = eqx.field(static=True, default=2)
+    terms: Annotated[tuple[float, ...], finite] = ()
+    __check_init__ = require_fields
+
+
+@checked
+def marked(*, modulus: Annotated[float, positive, "Pa"] = 1.0, share: Annotated[float, between(0, 1)] | None = None):
+    """Arguments with marks."""
+    return modulus, share
+
+
+@pytest.mark.parametrize(
+    ("make", "values", "says"),
+    [
+        (Marked, {"modulus": 0.0}, "Marked's modulus [Pa] must be greater than zero, got 0.0."),
+        (Marked, {"modulus": "stiff"}, "Marked's modulus must be a number, got 'stiff'."),
+        (Marked, {"share": 1.0}, "Marked's share must be strictly between 0 and 1, got 1.0."),
+        (Marked, {"count": 1}, "Marked's count must be a whole number of at least 2, got 1."),
+        (Marked, {"terms": (1.0, np.inf)}, "Marked's terms must be finite, got (1.0, inf)."),
+        (marked, {"modulus": -1.0}, "marked's modulus [Pa] must be greater than zero, got -1.0."),
+        (marked, {"share": 1.5}, "marked's share must be from 0 to 1, got 1.5."),
+    ],
+)
+def test_annotations_say_what_must_hold_of_values(make, values, says):
+    """Of fields and of arguments, known or not yet; None is not looked at."""
+    make(share=None)
+    with pytest.raises(ValueError, match=f"^{re.escape(says)}$"):
+        make(**values)
+
+
+def test_a_mark_on_a_traced_field_is_put_off():
+    """Until a compiled program can evaluate it."""
+
+    @jax.jit
+    def unmet(modulus):
+        return first_unmet(requirements(Marked(modulus)))
+
+    assert [int(unmet(modulus)) for modulus in (1.0, -1.0, jnp.nan)] == [0, 2, 1]
