@@ -272,6 +272,9 @@ def fit_result(
         wider = np.where(seen, each.error, 1) / np.where(seen, noise_alone.error, 1)
         ends = intervals(problem, z, each, gradient / wider**2, level)
         columns += [np.abs(np.asarray(slope, float)) * each.error, np.stack(ends, axis=1)]
+    # Few degrees of freedom of the noise are more beside what the grid adds: an interval is never the narrower for it.
+    (lower, upper), (lowest, highest) = columns[4].T, columns[6].T
+    columns[4] = np.stack([np.minimum(lower, lowest), np.maximum(upper, highest)], axis=1)
     numbers = zip(problem.labels, problem.owners, *(np.asarray(column).tolist() for column in columns), strict=True)
     reported = []
     for name, of in report.items():
@@ -282,10 +285,10 @@ def fit_result(
         number, start, both = float(value(z)), float(value(jnp.zeros_like(z))), []
         for each in (errors, noise_alone):
             error, freedom = each.of(np.asarray(jax.jacfwd(value)(z), float))
-            reach = float(quantile(level, freedom) * error)
-            both.append((float(error), (number - reach, number + reach)))
-        (error, ends), by_noise = both
-        reported.append(Estimate(name, number, error, ends, "", start, False, *by_noise))
+            both.append((float(error), float(quantile(level, freedom) * error)))
+        reach = max(by for _, by in both), both[1][1]
+        ends, alone = ((number - by, number + by) for by in reach)
+        reported.append(Estimate(name, number, both[0][0], ends, "", start, False, both[1][0], alone))
     degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
     texts = seen_together(problem.labels, errors, problem.logarithmic)
     result = FitResult(
@@ -315,7 +318,7 @@ def fit_result(
     )
     if result.p_value < IMPROBABLE:
         share = 1 - (rest @ rest) / (r @ r)
-        alike = f", {share:.0%} of its square as twice the spacing changes it" if isinstance(coarse, CoarseGrid) else ""
+        alike = f", of whose square twice the spacing explains {share:.0%}" if isinstance(coarse, CoarseGrid) else ""
         texts.append(
             f"The misfit is {np.sqrt(result.chi_squared / result.degrees_of_freedom):.2g} times the noise given"
             f"{alike}: the model or its discretisation does not explain the data. Errors hold it."
