@@ -4,12 +4,12 @@
     python benchmarks/wild_fits.py --false-minima [--draws 20]
 
 Motions of a square by an MLS-MPM in NumPy (`peers/numpy_mpm.py`) on a grid four times finer than the fit's: stretched,
-sheared or twisted as it starts, dropped on a floor, slumping on one that holds it, as two elastic solids; stretched for
-four periods; of a disc that is dropped, a tower that sways, an L that spins and stretches; a fluid and sand that
-collapse. By closed forms: a standing wave, a bar that vibrates, a block that is pressed. Markers (of the press force and
-width) are seen with noise of 1 % of the amplitude. `mpm.fit` finds E and ν (E alone of wave and bar, the viscosity, the
-friction angle), from starts within half a decade, as it does by default; with --one-grid it does not look at twice the
-spacing; with --refine `fit_refined` fits on twice as many cells too.
+sheared or twisted as it starts, dropped on a floor, slumping on one that holds it, as two elastic solids; stretched
+for four periods; of a disc that is dropped, a tower that sways, an L that spins and stretches; a fluid and sand that
+collapse. By closed forms: a standing wave, a bar that vibrates, a block that is pressed. Markers (of the press force
+and width) are seen with noise of 1 % of the amplitude. `mpm.fit` finds E and ν (E alone of wave and bar, the
+viscosity, the friction angle), from starts within half a decade, as it does by default; with --one-grid it does not
+look at twice the spacing; with --refine `fit_refined` fits on twice as many cells too.
 
 A line a number: the truth, the estimate, its error, both intervals, and the width of the first over the error. Then,
 for all and for the motions that the rule of the intervals was not developed on, how many hold the truth.
