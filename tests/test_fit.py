@@ -1,6 +1,7 @@
 """Fits: parameters, observations, errors, and what is refused."""
 
 import html
+from functools import partial
 from unittest.mock import Mock
 
 import equinox as eqx
@@ -16,6 +17,8 @@ from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._result import Estimate, NoiseEstimate
 from mpmjax.fitting._search import iterate_alone, jacobian, search, search_many
 from mpmjax.fitting._sequence import _extrapolate, _missed
+
+fit = partial(mpm.fit, discretisation=False)  # most of these tests are of the search
 
 DT, STEPS, NOISE = 4e-3, 15, 1e-4
 
@@ -55,7 +58,7 @@ def both():
     x[5:, 2] = np.nan
     seen = mpm.Tracks(times, x, which=which, sigma=NOISE)
     shear = {"mu": lambda e: e.scene.material.shear_modulus}
-    return mpm.fit(experiment(seen, n=2), {"E": STIFFNESS, "nu": RATIO}, report=shear)
+    return fit(experiment(seen, n=2), {"E": STIFFNESS, "nu": RATIO}, report=shear)
 
 
 def test_notebooks_show_the_table_and_the_picture_of_a_fit(both):
@@ -73,7 +76,7 @@ def test_an_energy_as_analysis_says_it_is_an_observation():
     scene, particles = bar()
     run = mpm.simulate(scene, particles, t1=STEPS * DT, dt=DT, save_every=3, observe=stored)
     seen = mpm.Series(np.asarray(run.times)[1:], np.asarray(run.observed)[1:], stored, sigma=1e-4)
-    assert mpm.fit(experiment(seen), {"E": STIFFNESS}).values["E"] == pytest.approx(7e4, rel=1e-6)
+    assert fit(experiment(seen), {"E": STIFFNESS}).values["E"] == pytest.approx(7e4, rel=1e-6)
 
 
 def test_tracks_fix_stiffness_and_poissons_ratio(both):
@@ -151,7 +154,7 @@ def fitted_line(monkeypatch, y, prior=None, **options):
     times = np.linspace(0.001, 0.05, len(y))
     seen = mpm.Series(times, y, mpm.fitting.Extent(0), **options)
     monkeypatch.setattr("mpmjax.fitting._fit.FitProblem", lambda *_: Line(times * 20, seen, prior))
-    return mpm.fit([], {})
+    return fit([], {})
 
 
 @pytest.mark.thorough
@@ -202,7 +205,7 @@ def test_fits_in_single_precision_converge_and_large_moduli_are_numbers():
     run = mpm.simulate(scene, q, t1=15 * 3e-5, dt=3e-5, save_every=1)
     seen = mpm.Tracks(np.asarray(run.times)[1:], np.asarray(run.frames.x)[1:], which=np.arange(q.count), sigma=1e-6)
     softer = mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=8e8)
-    found = mpm.fit(mpm.Experiment(scene, q, t1=15 * 3e-5, dt=3e-5, observations=seen), {"E": softer})
+    found = fit(mpm.Experiment(scene, q, t1=15 * 3e-5, dt=3e-5, observations=seen), {"E": softer})
     assert found.converged
     assert found["E"].value == pytest.approx(1e9, rel=2e-2)
 
@@ -217,9 +220,9 @@ def test_what_the_data_do_see_of_a_pair_has_an_error():
     )
     seen = mpm.Tracks(times, x, which=which, sigma=NOISE)
     ratio = {"ratio": lambda e: e.scene.material.youngs_modulus / e.particles.mass[0] * start[0]}
-    alone = mpm.fit(experiment(seen), {"E": STIFFNESS})
+    alone = fit(experiment(seen), {"E": STIFFNESS})
     with pytest.warns(UserWarning, match="only their ratio"):
-        both = mpm.fit(experiment(seen), {"E": STIFFNESS, "density": heavier}, report=ratio)
+        both = fit(experiment(seen), {"E": STIFFNESS, "density": heavier}, report=ratio)
     assert both["ratio"].value == pytest.approx(alone["E"].value, rel=1e-4)
     assert both["ratio"].error == pytest.approx(alone["E"].error, rel=1e-2)
     assert both["E"].interval == (0, np.inf)
@@ -253,7 +256,7 @@ def test_the_force_on_a_collider_fixes_the_density_of_what_rests_on_it():
     mass = np.asarray(block.mass)
     scale = mpm.Positive(update=lambda e, f: eqx.tree_at(lambda e: e.particles.mass, e, f * mass), start=0.7)
     seen = mpm.fitting.Force(np.asarray(forces.times)[::2], np.asarray(forces.force)[::2, 0], sigma=0.1)
-    found = mpm.fit(mpm.Experiment(scene, block, observations=seen, **at), {"density": scale})
+    found = fit(mpm.Experiment(scene, block, observations=seen, **at), {"density": scale})
     assert found["density"].value == pytest.approx(1, rel=1e-4)
     with pytest.raises(ValueError, match="the scene has 1"):
         mpm.Experiment(scene, block, observations=mpm.fitting.Force([0.01], [[0.0, 0.0]], collider=3), **at)
@@ -274,8 +277,8 @@ def test_coordinates_start_at_zero_and_keep_to_the_bounds(parameter, start):
 def test_unknown_noise_is_estimated_and_errors_are_students():
     """The same data with σ given: the estimate is σ but for chance, the errors in proportion, the interval by t."""
     times, x, which = tracks()
-    given = mpm.fit(experiment(mpm.Tracks(times, x, which=which, sigma=NOISE)), {"E": STIFFNESS})
-    found = mpm.fit(experiment(mpm.Tracks(times, x, which=which)), {"E": STIFFNESS})
+    given = fit(experiment(mpm.Tracks(times, x, which=which, sigma=NOISE)), {"E": STIFFNESS})
+    found = fit(experiment(mpm.Tracks(times, x, which=which)), {"E": STIFFNESS})
     sigma = np.sqrt(given.chi_squared / (x.size - 1)) * NOISE
     assert found.noise[0].sigma == pytest.approx(sigma, rel=1e-4)
     assert found["E"].value == pytest.approx(given["E"].value, rel=1e-6)
@@ -293,7 +296,7 @@ def test_several_unknown_noises_are_estimated_each():
     rng = np.random.default_rng(4)
     bad = x + 30 * NOISE * rng.normal(size=x.shape)
     seen = [mpm.Tracks(times, x, which=which, name="good"), mpm.Tracks(times, bad, which=which, name="bad")]
-    found = mpm.fit(experiment(seen), {"E": STIFFNESS})
+    found = fit(experiment(seen), {"E": STIFFNESS})
     assert found.noise[0].sigma == pytest.approx(NOISE, rel=0.3)
     assert found.noise[1].sigma == pytest.approx(30 * NOISE, rel=0.3)
     assert abs(found["E"].value - 7e4) < 4 * found["E"].error
@@ -307,7 +310,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
     rng = np.random.default_rng(7)
     for _ in range(200):
         data = exact + NOISE * rng.normal(size=exact.shape)
-        result = mpm.fit(experiment(eqx.tree_at(lambda o: o.data, seen, data)), {"E": STIFFNESS})
+        result = fit(experiment(eqx.tree_at(lambda o: o.data, seen, data)), {"E": STIFFNESS})
         held += result["E"].interval[0] < 7e4 < result["E"].interval[1]
     assert 184 <= held <= 196
 
@@ -339,7 +342,7 @@ def test_a_prior_acts_as_one_more_measurement():
     """E = 5e4 ± 1 Pa rules over noisy tracks."""
     times, x, which = tracks()
     known = mpm.Positive(STIFFNESS.where, start=1e5, prior=mpm.fitting.Gaussian(5e4, 1.0))
-    found = mpm.fit(experiment(mpm.Tracks(times, x, which=which, sigma=10 * NOISE)), {"E": known})
+    found = fit(experiment(mpm.Tracks(times, x, which=which, sigma=10 * NOISE)), {"E": known})
     assert found["E"].value == pytest.approx(5e4, rel=1e-3)
     assert found["E"].error == pytest.approx(1.0, rel=0.05)
 
@@ -349,7 +352,7 @@ def test_outliers_count_little_with_a_robust_loss():
     times, x, which = tracks()
     x[4, 1] += 0.05
     plain, robust = (
-        mpm.fit(experiment(mpm.Tracks(times, x, which=which, sigma=NOISE, robust=limit)), {"E": STIFFNESS})
+        fit(experiment(mpm.Tracks(times, x, which=which, sigma=NOISE, robust=limit)), {"E": STIFFNESS})
         for limit in (None, 2.0)
     )
     assert abs(robust["E"].value / 7e4 - 1) < 0.05 * abs(plain["E"].value / 7e4 - 1)
@@ -366,7 +369,7 @@ def test_what_the_data_cannot_tell_apart_is_named():
     )
     seen = mpm.Tracks(times, x, which=which, sigma=NOISE)
     with pytest.warns(UserWarning, match="E and density: only their ratio is seen"):
-        found = mpm.fit(experiment(seen), {"E": STIFFNESS, "density": heavier})
+        found = fit(experiment(seen), {"E": STIFFNESS, "density": heavier})
     assert np.isinf(found["E"].error)
 
 
@@ -375,8 +378,8 @@ def test_two_experiments_share_a_parameter():
     """Each alone has √2 times the error."""
     times, x, which = tracks()
     seen = mpm.Tracks(times, x, which=which, sigma=NOISE)
-    one = mpm.fit(experiment(seen), {"E": STIFFNESS})
-    two = mpm.fit([experiment(seen), experiment(seen)], {"E": STIFFNESS})
+    one = fit(experiment(seen), {"E": STIFFNESS})
+    two = fit([experiment(seen), experiment(seen)], {"E": STIFFNESS})
     assert two["E"].value == pytest.approx(one["E"].value, rel=1e-5)
     assert two["E"].error * np.sqrt(2) == pytest.approx(one["E"].error, rel=1e-4)
 
@@ -469,7 +472,7 @@ REFUSED = {
 def test_bad_parameters_get_one_line(parameters, material, says):
     series = mpm.Series(*SERIES, lambda s, p: p.x.mean(), sigma=1.0)
     with pytest.raises(ValueError, match=says):
-        mpm.fit(experiment(series, **material), parameters)
+        fit(experiment(series, **material), parameters)
 
 
 BAD_DATA = {
@@ -509,7 +512,7 @@ def test_a_curve_that_the_run_does_not_reach_is_an_error_and_not_a_flat_line():
 def test_a_simulation_that_fails_at_the_first_guess_says_where():
     series = mpm.Series([0.01], ones(1), mpm.fitting.Extent(0), sigma=1.0)
     with pytest.raises(mpm.SimulationError, match="step"):
-        mpm.fit(experiment(series, E=1e9), {"E": mpm.Positive(STIFFNESS.where)})
+        fit(experiment(series, E=1e9), {"E": mpm.Positive(STIFFNESS.where)})
 
 
 @pytest.mark.thorough
@@ -524,9 +527,7 @@ def test_an_interruption_keeps_the_best_so_far():
             raise KeyboardInterrupt
 
     with pytest.warns(UserWarning, match="was interrupted"):
-        found = mpm.fit(
-            experiment(mpm.Tracks(times, x, which=which, sigma=NOISE)), {"E": STIFFNESS}, progress=interrupt
-        )
+        found = fit(experiment(mpm.Tracks(times, x, which=which, sigma=NOISE)), {"E": STIFFNESS}, progress=interrupt)
     assert not found.converged
     assert len(found.history) == 3
     assert found["E"].value == pytest.approx(float(problem_value(found)))
@@ -639,18 +640,18 @@ def test_a_measurements_zero_of_time_is_a_parameter():
     def late(e, by):
         return eqx.tree_at(lambda e: e.observations[0].times, e, seen.times + by)
 
-    found = mpm.fit(experiment(seen), {"late": mpm.Unbounded(update=late, start=0.5 * DT, scale=DT)})
+    found = fit(experiment(seen), {"late": mpm.Unbounded(update=late, start=0.5 * DT, scale=DT)})
     assert found["late"].value == pytest.approx(2 * DT, rel=1e-3)
     with pytest.raises(ValueError, match="times of 'series' out of the run"):
-        mpm.fit(experiment(seen), {"late": mpm.Unbounded(update=late, start=5.5 * DT, scale=DT)})
+        fit(experiment(seen), {"late": mpm.Unbounded(update=late, start=5.5 * DT, scale=DT)})
 
 
 def test_fits_with_new_data_do_not_compile_anew():
     times, x, which = tracks()
     seen = mpm.Tracks(times, x, which=which, sigma=NOISE)
-    mpm.fit(experiment(seen), {"E": STIFFNESS})
+    fit(experiment(seen), {"E": STIFFNESS})
     known = iterate_alone._cached._cache_size()
-    mpm.fit(experiment(eqx.tree_at(lambda o: o.data, seen, x + 1e-5)), {"E": STIFFNESS})
+    fit(experiment(eqx.tree_at(lambda o: o.data, seen, x + 1e-5)), {"E": STIFFNESS})
     assert iterate_alone._cached._cache_size() == known
 
 

@@ -3,6 +3,7 @@
 import functools
 import json
 from dataclasses import replace
+from functools import partial
 
 import diffrax
 import equinox as eqx
@@ -21,6 +22,8 @@ from mpmjax.fitting._result import fit_result
 from mpmjax.fitting._search import Search, iterate_alone, search_many
 from mpmjax.fitting._uncertainty import _mean_square, noise, seen_together, uncertainty
 from mpmjax.viz import draw_fit, write_fit
+
+fit = partial(mpm.fit, discretisation=False)  # most of these tests are of the search
 
 GIVEN_NOISE = [(jnp.ones(()), 1.0, 0.0)]
 
@@ -74,7 +77,7 @@ def exact(seen, sigma=None, level=0.95):
 def fall():
     """Gravity and speed, the noise estimated."""
     seen = measured()
-    return seen, mpm.fit(thrown(seen), {"g": GRAVITY, "v": SPEED})
+    return seen, fit(thrown(seen), {"g": GRAVITY, "v": SPEED})
 
 
 def test_profiles_of_a_linear_problem_are_students_intervals_in_any_coordinate(fall):
@@ -159,7 +162,7 @@ def test_an_interval_that_the_data_do_not_close_is_open():
     with the noise given, the threshold is that of χ²."""
     sigma = 0.05
     seen = measured(sigma, seed=1, sigma=sigma)
-    result = mpm.fit(thrown(seen), {"g": GRAVITY, "v": SPEED})
+    result = fit(thrown(seen), {"g": GRAVITY, "v": SPEED})
     found, covariance, reach, _ = exact(seen, sigma)
     half = reach * np.sqrt(covariance[0, 0])
     assert found[0] - half < 0 < found[0]
@@ -409,7 +412,7 @@ PUSH = mpm.Unbounded(update=lambda e, f: eqx.tree_at(lambda e: e.particles.v, e,
 def test_along_a_profile_the_others_are_at_their_least():
     """Stiffness and the strength of the push from few data: at each point SciPy's least squares over the other
     parameter finds the same misfit. In single precision the interval is the same."""
-    result = mpm.fit(followed(5e-3, 5e-3), {"E": STIFFNESS, "push": PUSH})
+    result = fit(followed(5e-3, 5e-3), {"E": STIFFNESS, "push": PUSH})
     profile = mpm.fitting.profile(result, "E", points=2)
     problem, residuals = result.problem, eqx.filter_jit(lambda p, z, s: p.residuals(z, s, None)[0])
 
@@ -426,7 +429,7 @@ def test_along_a_profile_the_others_are_at_their_least():
     assert profile.interval[0] < result["E"].value < profile.interval[1]
     for end in profile.interval:
         assert misfit(end) - least == pytest.approx(profile.threshold, rel=5e-3)
-    single = mpm.fit(followed(5e-3, 5e-3, "float32"), {"E": STIFFNESS, "push": PUSH})
+    single = fit(followed(5e-3, 5e-3, "float32"), {"E": STIFFNESS, "push": PUSH})
     assert np.allclose(mpm.fitting.profile(single, "E", points=2).interval, profile.interval, rtol=5e-3)
 
 
@@ -436,7 +439,7 @@ def test_what_the_data_do_not_see_has_an_infinite_band_and_an_open_profile():
     mass = np.asarray(bar()[1].mass)
     heavier = mpm.Positive(update=lambda e, f: eqx.tree_at(lambda e: e.particles.mass, e, f * mass), start=1.0)
     with pytest.warns(UserWarning, match="only their ratio"):
-        result = mpm.fit(followed(1e-4, 1e-4), {"E": STIFFNESS, "density": heavier})
+        result = fit(followed(1e-4, 1e-4), {"E": STIFFNESS, "density": heavier})
 
     def both(e):
         E = e.scene.material.youngs_modulus
@@ -454,7 +457,7 @@ def test_what_the_data_do_not_see_has_an_infinite_band_and_an_open_profile():
 @pytest.mark.thorough
 def test_noise_that_is_estimated_twice_has_a_threshold_of_its_own():
     """Two observations of unknown noise: between Student's of one and of both."""
-    result = mpm.fit(followed([1e-3, 5e-3], seeds=(1, 2)), {"E": STIFFNESS})
+    result = fit(followed([1e-3, 5e-3], seeds=(1, 2)), {"E": STIFFNESS})
     profile = mpm.fitting.profile(result, "E")
     points = result.noise[0].points
     assert t.ppf(0.975, 2 * points) ** 2 < profile.threshold < t.ppf(0.975, points - 1) ** 2 * 1.001
@@ -469,7 +472,7 @@ def test_bands_cover_the_truth_and_new_measurements_as_often_as_they_say():
     rng, truth = np.random.default_rng(11), 0.15 + design(2 * STEPS)[-1] @ [G, V]
     held = new = 0
     for seed in range(200):
-        result = mpm.fit(thrown(measured(seed=seed)), {"g": GRAVITY, "v": SPEED})
+        result = fit(thrown(measured(seed=seed)), {"g": GRAVITY, "v": SPEED})
         later = mpm.fitting.predict(result, twice_as_long)
         held += later.lower < truth < later.upper
         (band,) = mpm.fitting.predict_observations(result)
@@ -507,7 +510,7 @@ def test_intervals_cover_where_the_data_saturate():
     held = np.zeros(2, int)
     for seed in range(200):
         data = height + 3e-3 * np.random.default_rng(seed).normal(size=4)
-        result = mpm.fit(column(0.3, mpm.Series(times, data, settled, sigma=3e-3)), {"nu": ratio})
+        result = fit(column(0.3, mpm.Series(times, data, settled, sigma=3e-3)), {"nu": ratio})
         intervals = mpm.fitting.profile(result, "nu", points=1, rtol=1e-2).interval, result["nu"].interval
         held += [lower < 0.4 < upper for lower, upper in intervals]
     assert ((held >= 184) & (held <= 196)).all()

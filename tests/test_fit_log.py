@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -19,6 +20,8 @@ import pytest
 import mpmjax as mpm
 from mpmjax.fitting import _search
 from mpmjax.fitting._log import _read, described, iterations_left
+
+fit = partial(mpm.fit, discretisation=False)  # most of these tests are of the search
 
 DT, STEPS = 4e-3, 12
 PARAMETERS = {
@@ -58,7 +61,7 @@ def seen():
 def whole(seen, tmp_path_factory):
     """The fit, its log, and what it said."""
     path, lines = tmp_path_factory.mktemp("log") / "fit.h5", []
-    return mpm.fit(seen, PARAMETERS, log=path, progress=lines.append), path, lines
+    return fit(seen, PARAMETERS, log=path, progress=lines.append), path, lines
 
 
 def stop_after(lines):
@@ -85,7 +88,7 @@ def assert_same(a, b):
 def test_a_fit_is_the_same_with_a_log_and_takes_rounds(whole, seen):
     found, path, _ = whole
     assert sum(i.number == 0 for i in found.history) > 2
-    assert_same(mpm.fit(seen, PARAMETERS), found)
+    assert_same(fit(seen, PARAMETERS), found)
     assert os.listdir(path.parent) == ["fit.h5"]
 
 
@@ -93,17 +96,17 @@ def test_a_fit_is_the_same_with_a_log_and_takes_rounds(whole, seen):
 def test_an_interrupted_fit_is_continued_to_the_same_bits(whole, seen, tmp_path, after):
     """Ctrl-C after iterations of the first and of a later round of the noise."""
     with pytest.warns(UserWarning, match="was interrupted"):
-        part = mpm.fit(seen, PARAMETERS, log=tmp_path / "fit.h5", progress=stop_after(1 + after))
+        part = fit(seen, PARAMETERS, log=tmp_path / "fit.h5", progress=stop_after(1 + after))
     assert part.interrupted
     assert len(part.history) == after < len(whole[0].history)
     assert eqx.tree_equal(part.history, whole[0].history[:after])
-    assert_same(mpm.fit(seen, PARAMETERS, log=tmp_path / "fit.h5", resume=True), whole[0])
+    assert_same(fit(seen, PARAMETERS, log=tmp_path / "fit.h5", resume=True), whole[0])
 
 
 def test_a_fit_that_was_done_is_its_result_at_once(whole, seen, monkeypatch):
     monkeypatch.setattr(_search, "iterate", None)
     lines = []
-    assert_same(mpm.fit(seen, PARAMETERS, log=whole[1], resume=True, progress=lines.append), whole[0])
+    assert_same(fit(seen, PARAMETERS, log=whole[1], resume=True, progress=lines.append), whole[0])
     assert f"after {len(whole[0].history)} iterations of the log" in lines[0]
 
 
@@ -112,8 +115,8 @@ def test_a_log_without_iterations_begins_the_fit(whole, seen, tmp_path, monkeypa
     with monkeypatch.context() as patched:
         patched.setattr(_search, "iterate", None)
         with pytest.raises(TypeError):
-            mpm.fit(seen, PARAMETERS, log=tmp_path / "fit.h5")
-    assert_same(mpm.fit(seen, PARAMETERS, log=tmp_path / "fit.h5", resume=True), whole[0])
+            fit(seen, PARAMETERS, log=tmp_path / "fit.h5")
+    assert_same(fit(seen, PARAMETERS, log=tmp_path / "fit.h5", resume=True), whole[0])
 
 
 def test_a_script_reads_the_log(whole):
@@ -176,7 +179,7 @@ OTHERS = {
 def test_the_log_of_another_fit_is_refused_in_one_line(whole, seen, change, parameters, others, says):
     before = whole[1].read_bytes()
     with pytest.raises(ValueError, match=says):
-        mpm.fit(change(seen), PARAMETERS | parameters, log=whole[1], resume=True, **others)
+        fit(change(seen), PARAMETERS | parameters, log=whole[1], resume=True, **others)
     assert whole[1].read_bytes() == before
 
 
@@ -185,24 +188,24 @@ def test_a_fit_that_was_too_short_goes_on(whole, seen, tmp_path):
     """With more iterations allowed."""
     path = tmp_path / "fit.h5"
     with pytest.warns(UserWarning, match="did not converge"):
-        mpm.fit(seen, PARAMETERS, log=path, optimiser=mpm.fitting.LevenbergMarquardt(max_steps=2))
-    assert_same(mpm.fit(seen, PARAMETERS, log=path, resume=True), whole[0])
+        fit(seen, PARAMETERS, log=path, optimiser=mpm.fitting.LevenbergMarquardt(max_steps=2))
+    assert_same(fit(seen, PARAMETERS, log=path, resume=True), whole[0])
 
 
 def test_what_is_no_log_is_refused_and_stays(whole, seen, tmp_path):
     path = tmp_path / "fit.h5"
     for resume, says in ((True, "does not exist"), (False, "exists: choose another name")):
         with pytest.raises(ValueError, match=says):
-            mpm.fit(seen, PARAMETERS, log=path, resume=resume)
+            fit(seen, PARAMETERS, log=path, resume=resume)
         path.write_bytes(whole[1].read_bytes())
     with pytest.raises(ValueError, match="no folder"):
-        mpm.fit(seen, PARAMETERS, log=tmp_path / "nowhere" / "fit.h5")
+        fit(seen, PARAMETERS, log=tmp_path / "nowhere" / "fit.h5")
     with pytest.raises(ValueError, match="name it by log"):
-        mpm.fit(seen, PARAMETERS, resume=True)
+        fit(seen, PARAMETERS, resume=True)
     with h5py.File(tmp_path / "other.h5", "w") as other:
         other["x"] = 1.0
     with pytest.raises(ValueError, match="is not the log of a fit"):
-        mpm.fit(seen, PARAMETERS, log=tmp_path / "other.h5", resume=True)
+        fit(seen, PARAMETERS, log=tmp_path / "other.h5", resume=True)
 
 
 def test_a_damaged_log_is_refused(whole, seen, tmp_path):
@@ -226,7 +229,7 @@ def test_a_damaged_log_is_refused(whole, seen, tmp_path):
     with h5py.File(path, "w") as file:
         file.attrs["kind"], file.attrs["format"] = np.bytes_("mpmjax fit log"), 1
     with pytest.raises(ValueError, match=r"is a log of format 1, this mpmjax reads 2: begin the fit anew"):
-        mpm.fit(seen, PARAMETERS, log=path, resume=True)
+        fit(seen, PARAMETERS, log=path, resume=True)
 
 
 def test_a_log_has_one_writer(seen, tmp_path):
@@ -235,10 +238,10 @@ def test_a_log_has_one_writer(seen, tmp_path):
     def progress(line):
         if not said and line.lstrip().startswith("1 "):
             with pytest.raises(ValueError, match="is being written by another run") as refused:
-                mpm.fit(seen, PARAMETERS, log=path, resume=True)
+                fit(seen, PARAMETERS, log=path, resume=True)
             said.append(str(refused.value))
 
-    mpm.fit(seen, PARAMETERS, log=path, progress=progress)
+    fit(seen, PARAMETERS, log=path, progress=progress)
     assert said
 
 
@@ -256,7 +259,7 @@ def test_a_log_that_was_replaced_meanwhile_is_left_alone(seen, tmp_path):
             path.write_text("another")
 
     with pytest.raises(OSError, match=r"fit\.h5 was replaced by another file while it was written"):
-        mpm.fit(seen, PARAMETERS, log=path, progress=progress)
+        fit(seen, PARAMETERS, log=path, progress=progress)
     assert path.read_text() == "another"
 
 
@@ -268,12 +271,12 @@ def test_a_full_disk_leaves_the_log_as_it_was(whole, seen, tmp_path, monkeypatch
             monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(full))
 
     with pytest.raises(OSError, match=r"No space left on device.*make room, then resume"):
-        mpm.fit(seen, PARAMETERS, log=path, progress=progress)
+        fit(seen, PARAMETERS, log=path, progress=progress)
     monkeypatch.undo()
     with h5py.File(path) as f:
         assert len(f["iterations"]) == 3
     assert os.listdir(tmp_path) == ["fit.h5"]
-    assert_same(mpm.fit(seen, PARAMETERS, log=path, resume=True), whole[0])
+    assert_same(fit(seen, PARAMETERS, log=path, resume=True), whole[0])
 
 
 PROGRAM = """
@@ -289,7 +292,7 @@ def progress(line):
     left -= 1
     if left == 0:
         os.kill(os.getpid(), signal.SIGKILL)
-mpm.fit(experiment(), PARAMETERS, log={log!r}, progress=progress)
+mpm.fit(experiment(), PARAMETERS, discretisation=False, log={log!r}, progress=progress)
 """
 
 
@@ -302,7 +305,7 @@ def test_a_killed_fit_is_continued_to_the_same_bits(whole, seen, tmp_path, after
     assert done.returncode == -signal.SIGKILL, done.stderr
     with h5py.File(tmp_path / "fit.h5") as f:
         assert len(f["iterations"]) == after
-    assert_same(mpm.fit(seen, PARAMETERS, log=tmp_path / "fit.h5", resume=True), whole[0])
+    assert_same(fit(seen, PARAMETERS, log=tmp_path / "fit.h5", resume=True), whole[0])
 
 
 def test_progress_tells_what_is_going_on(whole):

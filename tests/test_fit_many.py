@@ -1,5 +1,7 @@
 """Fits of many parameters: optimisers on reverse mode, Jacobians in batches, fields and their priors."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,8 @@ import mpmjax as mpm
 from mpmjax.fitting._fit import MOST_COLUMNS, chosen_optimiser
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import NO_DERIVATIVE, iterate_alone, search
+
+fit = partial(mpm.fit, discretisation=False)  # most of these tests are of the search
 
 SIGMAS = (jnp.asarray(NOISE),)
 BANDS = mpm.Positive(
@@ -108,8 +112,8 @@ def test_the_gradient_and_all_jacobians_agree_with_differences():
 def test_lbfgs_reaches_the_minimum_of_levenberg_marquardt():
     """Four stiffnesses of a bar: the same values and errors, and the table says who found them."""
     of = experiment(seen())
-    least = mpm.fit(of, {"E": BANDS})
-    found = mpm.fit(of, {"E": BANDS}, optimiser=mpm.fitting.LBFGS())
+    least = fit(of, {"E": BANDS})
+    found = fit(of, {"E": BANDS}, optimiser=mpm.fitting.LBFGS())
     assert found.converged
     assert np.allclose(found.z, least.z, atol=1e-2 * least.uncertainty.error.min())
     assert np.allclose(found.uncertainty.error, least.uncertainty.error, rtol=1e-2)
@@ -120,8 +124,8 @@ def test_lbfgs_reaches_the_minimum_of_levenberg_marquardt():
 @pytest.mark.thorough
 def test_adam_reaches_it_too():
     of = experiment(seen())
-    least = mpm.fit(of, {"E": STIFFNESS})
-    found = mpm.fit(of, {"E": STIFFNESS}, optimiser=mpm.fitting.Adam())
+    least = fit(of, {"E": STIFFNESS})
+    found = fit(of, {"E": STIFFNESS}, optimiser=mpm.fitting.Adam())
     assert found.converged
     assert abs(found.z - least.z) < 0.1 * least.uncertainty.error
 
@@ -132,8 +136,8 @@ def test_fits_by_lbfgs_converge_in_single_precision():
     scene, q = bar()
     single = jax.tree.map(lambda a: a.astype("float32"), q)
     of, exact = (mpm.Experiment(scene, p, t1=STEPS * DT, dt=DT, observations=seen()) for p in (single, q))
-    found = mpm.fit(of, {"E": BANDS}, optimiser=mpm.fitting.LBFGS())
-    least = mpm.fit(exact, {"E": BANDS}, optimiser=mpm.fitting.LevenbergMarquardt())
+    found = fit(of, {"E": BANDS}, optimiser=mpm.fitting.LBFGS())
+    least = fit(exact, {"E": BANDS}, optimiser=mpm.fitting.LevenbergMarquardt())
     assert found.converged
     assert (np.abs(found.z - least.z) < 0.2 * least.uncertainty.error).all()
 
@@ -146,7 +150,7 @@ def test_an_adjoint_solve_that_does_not_converge_is_reported():
     of = mpm.Experiment(scene, q, t1=STEPS * DT, dt=DT, method=few, observations=seen(n=2))
     for optimiser in (mpm.fitting.LBFGS(), mpm.fitting.Adam()):
         with pytest.raises(RuntimeError, match="has no derivative"):
-            mpm.fit(of, {"E": STIFFNESS}, optimiser=optimiser)
+            fit(of, {"E": STIFFNESS}, optimiser=optimiser)
 
 
 @pytest.mark.thorough
@@ -155,20 +159,20 @@ def test_what_has_no_influence_is_refused_without_a_jacobian():
     times, x, which = tracks(sigma=None)
     exact = mpm.Tracks(times, x, which=which, sigma=NOISE)
     true = mpm.Positive(STIFFNESS.where)
-    found = mpm.fit(experiment(exact), {"E": true}, optimiser=mpm.fitting.LBFGS())
+    found = fit(experiment(exact), {"E": true}, optimiser=mpm.fitting.LBFGS())
     assert found["E"].value == pytest.approx(7e4, rel=1e-6)
     unseen = mpm.Series(times, np.zeros(len(times)), lambda s, p: p.mass.sum(), sigma=1.0)
     with pytest.raises(ValueError, match="do not depend on E"):
-        mpm.fit(experiment(unseen), {"E": STIFFNESS}, optimiser=mpm.fitting.LBFGS())
+        fit(experiment(unseen), {"E": STIFFNESS}, optimiser=mpm.fitting.LBFGS())
 
 
 @pytest.mark.thorough
 def test_fits_by_lbfgs_with_new_data_do_not_compile_anew():
     of = seen()
-    mpm.fit(experiment(of), {"E": STIFFNESS}, optimiser=mpm.fitting.LBFGS())
+    fit(experiment(of), {"E": STIFFNESS}, optimiser=mpm.fitting.LBFGS())
     known = iterate_alone._cached._cache_size()
     again = mpm.fitting.LBFGS(rtol=2e-3)
-    mpm.fit(experiment(eqx.tree_at(lambda o: o.data, of, of.data + 1e-5)), {"E": STIFFNESS}, optimiser=again)
+    fit(experiment(eqx.tree_at(lambda o: o.data, of, of.data + 1e-5)), {"E": STIFFNESS}, optimiser=again)
     assert iterate_alone._cached._cache_size() == known
 
 

@@ -11,7 +11,8 @@ from helpers import thorough
 from test_fit import DT, NOISE, RATIO, experiment, tracks
 
 import mpmjax as mpm
-from mpmjax.fitting._estimate import shape_of
+from mpmjax.fitting._discretisation import CoarseGrid, unexplained
+from mpmjax.fitting._estimate import shape_of, strongest_mode
 from mpmjax.verification import StandingWave, discretise
 
 E, SIDE = 7e4, 0.4
@@ -108,8 +109,10 @@ def test_residuals_that_are_no_noise_are_named(both_grids):
             assert any("residuals of 'series'" in text for text in texts) == bool(shape)
             assert ("by noise alone" in table) == bool(shape)
             assert stiff.interval[0] < E < stiff.interval[1]
-            wider = np.sqrt(160 / seen.worth) * (seen.misfit if seen.is_beyond else min(seen.misfit, 1))
-            assert stiff.error == pytest.approx((wider if shape else 1) * stiff.noise_error, rel=0.01)
+            r = found.residuals.reshape(80, 2)
+            strongest = np.linalg.eigvalsh(r.T @ r)[-1] - (np.sqrt(80) + np.sqrt(2)) ** 2
+            wider = max(160 / seen.worth * min(seen.misfit, 1) ** 2, strongest if seen.is_beyond else 1)
+            assert stiff.error == pytest.approx(np.sqrt(wider if shape else 1) * stiff.noise_error, rel=0.01)
             assert f"{seen.worth:.2g} independent numbers" in table or not shape
             assert seen.is_beyond == (bool(shape) if sigma is None else shape == "a ramp")
 
@@ -125,6 +128,31 @@ def test_correlated_numbers_are_worth_what_theory_says():
     assert sum(kind != "" for _, kind in white) < 5
     common = rng.normal(size=(40, 1)) + 0.1 * rng.normal(size=(40, 20))
     assert shape_of(common)[0] == pytest.approx(20, rel=0.2)
+
+
+def test_misfit_that_is_like_the_change_on_twice_the_spacing_is_explained():
+    """A third of that change, as of the order two, and noise leave the noise; a misfit of another kind stays whole, and
+    so does one that is more than the change. A change that parameters make up for explains nothing."""
+    rng = np.random.default_rng(0)
+    J, change, noise = rng.normal(size=(400, 2)), 9 * rng.normal(size=400), rng.normal(size=400)
+    change, noise = (a - J @ np.linalg.lstsq(J, a)[0] for a in (change, noise))
+    for r, by, left in (
+        (change / 3 + noise, change + J @ [5.0, -3.0], noise),
+        (noise, change, noise),
+        (-change / 3, change, -change / 3),
+        (2 * change, change, change),
+        (noise, J @ [5.0, -3.0], noise),
+    ):
+        rest = unexplained(r, J, CoarseGrid(np.zeros((2, 2)), r + by))
+        assert np.linalg.norm(rest - left) < 0.1 * np.linalg.norm(left)
+    assert np.array_equal(unexplained(noise, J, "unknown"), noise)
+
+
+def test_the_strongest_mode_is_that_of_a_discrepancy_and_none_of_noise():
+    rng = np.random.default_rng(0)
+    mode, white = np.outer(np.sin(np.arange(80)), np.ones(12)), rng.normal(size=(200, 80, 12))
+    assert np.mean([strongest_mode(rows) for rows in white]) < 0.1 * 12
+    assert strongest_mode(5 * mode + white[0]) == pytest.approx(25 * (mode**2).sum(), rel=0.05)
 
 
 @pytest.mark.parametrize("steps", [80, *thorough(20)])
@@ -158,7 +186,7 @@ def test_twice_the_spacing_tells_of_an_error_that_leaves_no_misfit():
     Spacing and step move it to opposite sides, together to where a fit on both ends; the interval holds each."""
     guess = stiffness(2e4)
     missed, found, coarse = (
-        mpm.fit(wave(n), guess, discretisation=looks) for n, looks in ((1, "auto"), (1, True), (2, False))
+        mpm.fit(wave(n), guess, discretisation=looks) for n, looks in ((1, False), (1, True), (2, False))
     )
     true, e = 1e4, found["E"]
     assert missed.moved is None

@@ -15,6 +15,8 @@ from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import search, search_many
 from mpmjax.fitting._starts import critical_distance, linked, starting_points, unit_points
 
+fit = partial(mpm.fit, discretisation=False)  # most of these tests are of the search
+
 LM, Starts = mpm.fitting.LevenbergMarquardt(), mpm.fitting.Starts
 TIMES = np.linspace(0.001, 0.05, 40)
 
@@ -49,7 +51,7 @@ OMEGA = mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=500.0)
 def oscillation(monkeypatch):
     def fitted(gap=np.inf, **options):
         monkeypatch.setattr("mpmjax.fitting._fit.FitProblem", partial(Oscillation, gap=gap))
-        return mpm.fit([], {"omega": OMEGA}, starts=Starts(**options))
+        return fit([], {"omega": OMEGA}, starts=Starts(**options))
 
     return fitted
 
@@ -64,7 +66,7 @@ def test_many_starts_find_the_least_of_many_minima(oscillation, fraction):
     derivative, and they hinder no other. Searches from fewer than half of the points stand for all, or all are."""
     found = oscillation(gap=795.0, count=32, fraction=fraction, ranges=RANGES, batch=5)
     with pytest.warns(UserWarning, match="times the noise given"):
-        alone = mpm.fit([], {"omega": OMEGA}, starts=1)
+        alone = fit([], {"omega": OMEGA}, starts=1)
     assert abs(alone["omega"].value - 400) > 100
     assert found["omega"].value == pytest.approx(400, abs=4 * found["omega"].error)
     look = found.screening
@@ -221,7 +223,7 @@ def test_an_ensemble_says_what_fits_say_one_by_one():
     assert np.isnan(found.values["E"][1])
     assert np.isnan(found.errors[1]).all()
     for k in (0, 2, 3):
-        alone = mpm.fit(sets[k], {"E": STIFFNESS})
+        alone = fit(sets[k], {"E": STIFFNESS})
         assert found.fits[k]["E"].value == pytest.approx(alone["E"].value, rel=1e-6)
         assert found.fits[k]["E"].error == pytest.approx(alone["E"].error, rel=1e-4)
         assert found.fits[k].noise[0].sigma == pytest.approx(alone.noise[0].sigma, rel=1e-4)
@@ -242,7 +244,7 @@ def test_specimens_with_one_value_are_said_to_be_alike():
 def test_the_bootstrap_agrees_with_the_linear_error():
     """Of a problem that is nearly linear."""
     times, x, which = tracks()
-    fitted = mpm.fit(experiment(mpm.Tracks(times, x, which=which, sigma=NOISE)), {"E": STIFFNESS})
+    fitted = fit(experiment(mpm.Tracks(times, x, which=which, sigma=NOISE)), {"E": STIFFNESS})
     drawn = mpm.fitting.bootstrap(fitted, repeats=200)
     assert drawn["E"].error == pytest.approx(fitted["E"].error, rel=0.15)
     assert drawn["E"].interval == pytest.approx(fitted["E"].interval, rel=0.3 * fitted["E"].error / 7e4)

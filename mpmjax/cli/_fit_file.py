@@ -38,7 +38,7 @@ class FitFile(NamedTuple):
     starts: Literal["auto"] | Starts  # from where it is searched
     horizons: tuple[float, ...] | bool  # until which times it is fitted first [s]; true to choose them, false for none
     refine: tuple[int, ...]  # on how many times as many cells a direction it is fitted besides; empty for none
-    discretisation: bool | Literal["auto"]  # whether a single grid's fit looks at twice the spacing
+    discretisation: bool  # whether a single grid's fit looks at twice the spacing
     whole: tuple[Experiment, ...]
     """The experiments over the whole of their runs, with all that was measured: also what is not fitted."""
     refined: Callable[[int], tuple[tuple[Experiment, ...], tuple[Experiment, ...]]]
@@ -110,7 +110,7 @@ def fit_settings(
     fraction: Scalar | None = None,
     horizons: tuple[float, ...] | bool = False,
     refine: int | tuple[int, ...] = (),
-    discretisation: bool | Literal["auto"] = "auto",
+    discretisation: bool = True,
     optimiser: AbstractOptimiser | None = None,
 ) -> dict[str, Any]:
     """How to fit, of a [fit] table."""

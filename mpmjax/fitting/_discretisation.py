@@ -1,6 +1,7 @@
 """How far a minimum moves on twice the spacing and step: the part of its error that the discretisation makes."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,17 +24,25 @@ def coarsened(experiment: Experiment, longer: int) -> Experiment:
     return replace(experiment, scene=scene, dt=experiment.t1 / -(-experiment.steps // longer))
 
 
-def changes_on_coarse_grid(
+class CoarseGrid(NamedTuple):
+    """The look at twice the spacing, and at twice the step there."""
+
+    moved: Float[np.ndarray, "2 n"]
+    """How far the minimum moves on twice the spacing, and from there with twice the step: two numbers, because errors
+    of spacing and step often have opposite signs."""
+    residuals: Float[np.ndarray, "m"]  # those of the minimum on twice the spacing
+
+
+def look_at_coarse_grid(
     problem: FitProblem, z: Coordinates, sigmas: Sigmas, jacobian: Float[np.ndarray, "m n"]
-) -> Float[np.ndarray, "2 n"] | str:
-    """How far the minimum z moves on twice the spacing, and from there with twice the step; or why that is not known.
-    They are two numbers because errors of spacing and step often have opposite signs.
+) -> CoarseGrid | str:
+    """The look at twice the spacing from the minimum z, or why there is none.
 
     Gauss-Newton steps −(JᵀJ)⁻¹ Jᵀ r with the residuals r of the coarse grid and the Jacobian of the fine one, three at
     most of each, while they lower Σ r². What a bound holds has no column in the Jacobian.
     """
     inverse = uncertainty(jacobian, float(jnp.finfo(problem.dtype).eps), ()).inverse
-    places = [np.asarray(z, float)]
+    places, first = [np.asarray(z, float)], None
     for longer in (1, 2):
         try:
             experiments = tuple(coarsened(e, longer) for e in problem.experiments)
@@ -46,6 +55,7 @@ def changes_on_coarse_grid(
                 r = np.asarray(residuals_at(coarse, jnp.asarray(tried[-1:], problem.dtype), sigmas, kept), float)[0]
             except KeyboardInterrupt:
                 return "interrupted."
+            first = r if first is None else first
             if not (r**2).sum() < least:
                 # The first step stays even so: it is what a linear model says.
                 tried = tried[: max(len(tried) - 1, 2)]
@@ -55,11 +65,24 @@ def changes_on_coarse_grid(
         if not np.isfinite(least):
             return "the simulation fails there."
         places.append(tried[-1])
-    return np.diff(places, axis=0)
+    return CoarseGrid(np.diff(places, axis=0), np.asarray(first))
+
+
+def unexplained(
+    r: Float[np.ndarray, "m"], J: Float[np.ndarray, "m n"], coarse: CoarseGrid | str | None
+) -> Float[np.ndarray, "m"]:
+    """The part of residuals r that is not like their change on twice the spacing, as far as parameters, with the
+    Jacobian J, do not make up for that. An error of the order two is a third of that change."""
+    if not isinstance(coarse, CoarseGrid):
+        return r
+    change = coarse.residuals - r
+    change = change - J @ np.linalg.lstsq(J, change)[0]
+    share = (r @ change) / max(change @ change, np.finfo(float).tiny)
+    return r - np.clip(share, 0, 1) * change
 
 
 def changes_shown(problem: FitProblem, z: np.ndarray, moved: Float[np.ndarray, "2 n"] | str | None) -> list[str]:
-    """Lines that say where the minimum moves, as of `changes_on_coarse_grid`; none where it was not looked at."""
+    """Lines that say where the minimum moves, as of `CoarseGrid`; none where it was not looked at."""
     if moved is None or isinstance(moved, str):
         return [f"on twice the spacing: not known: {moved}"] if moved else []
     spacing, both = (problem.shown(place) for place in z + np.cumsum(moved, axis=0))

@@ -15,7 +15,7 @@ import numpy as np
 
 from mpmjax._types import Scalar
 from mpmjax.checks import between, checked, require, warn
-from mpmjax.fitting._discretisation import changes_on_coarse_grid
+from mpmjax.fitting._discretisation import look_at_coarse_grid
 from mpmjax.fitting._estimate import table
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._log import recorded
@@ -45,7 +45,7 @@ def fit(
     parameters: dict[str, AbstractParameter],
     *,
     starts: int | Literal["auto"] | Starts = "auto",
-    discretisation: bool | Literal["auto"] = "auto",
+    discretisation: bool = True,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Level = 0.95,
     optimiser: AbstractOptimiser | None = None,
@@ -83,9 +83,8 @@ def fit(
             is beyond the noise, 24 more points are looked at, a simulation each, and some searched from, until a misfit
             is within it; `result.screening` has what they found. 1 searches from the first guess alone.
         discretisation: whether to look at twice the spacing, and at twice the step there, by three runs each at most,
-            and count as errors how far the minimum moves, as the grid convergence index does. "auto": where the misfit
-            is beyond the noise, or residuals have a shape. What parameters wholly make up for leaves neither: take True
-            for a number that is to be published.
+            and count as errors how far the minimum moves, as the grid convergence index does. Without it nobody knows:
+            what parameters make up for leaves no misfit.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
         optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, with few
@@ -158,12 +157,11 @@ def fit(
         require_end(end)
         tried = "" if screening is None else f"No search of {len(screening.searched)} came to a minimum: {end.failure}."
         problem.explain(zeros, *([tried] if tried else []))
-    looks = any(n.is_beyond or n.shape for n in result.noise) if discretisation == "auto" else discretisation
-    if looks and result.converged and settled is not None:
+    if discretisation and settled is not None and not end.interrupted:
         say("looking at twice the spacing")
         free = np.array([not e.at_bound for e in result.estimates])
-        moved = changes_on_coarse_grid(problem, end.z, result.sigmas, result.jacobian * free)
-        result = fit_result(problem, optimiser, end, settled, report, level, moved)
+        coarse = look_at_coarse_grid(problem, end.z, result.sigmas, result.jacobian * free)
+        result = fit_result(problem, optimiser, end, settled, report, level, coarse)
     result = replace(result, history=history, screening=screening)
     if not result.converged:
         stopped = "was interrupted" if result.interrupted else "did not converge"

@@ -12,7 +12,7 @@ import numpy as np
 
 from mpmjax._types import Array
 from mpmjax.checks import require
-from mpmjax.fitting._discretisation import changes_shown
+from mpmjax.fitting._discretisation import CoarseGrid, changes_shown, unexplained
 from mpmjax.fitting._estimate import (
     IMPROBABLE,
     VALUE,
@@ -21,6 +21,7 @@ from mpmjax.fitting._estimate import (
     NoiseEstimate,
     improbable,
     shape_of,
+    strongest_mode,
     table,
 )
 from mpmjax.fitting._experiment import Experiment
@@ -235,23 +236,28 @@ def fit_result(
     settled: Noise,
     report: Mapping[str, Callable[[Experiment], Any]],
     level: float,
-    moved: np.ndarray | str | None = None,
+    coarse: CoarseGrid | str | None = None,
 ) -> FitResult:
     """The result at a minimum, with residuals in units of its search's noise; options as of `fit` and its result."""
     r, J = np.array(minimum.seen.residuals, float), np.array(minimum.seen.jacobian, float)
+    for rows, (_, factor, _) in zip(problem.rows, settled, strict=True):
+        r[rows], J[rows] = r[rows] / factor, J[rows] / factor
+    rest, moved = unexplained(r, J, coarse), coarse.moved if isinstance(coarse, CoarseGrid) else coarse
     eps, z, noises, of_noise, of_misfit = float(jnp.finfo(problem.dtype).eps), minimum.z, [], [], []
     each = zip(problem.observations, problem.rows, problem.noise_is_given, settled, strict=True)
-    for o, rows, is_given, (sigma, factor, freedom) in each:
-        r[rows], J[rows] = r[rows] / factor, J[rows] / factor
+    for o, rows, is_given, (sigma, _, freedom) in each:
         size, misfit = np.sqrt((np.asarray(sigma) ** 2).mean()), np.sqrt((r[rows] ** 2).sum() / max(o.count, 1))
         ratio, left = noise(r, J, rows, o.count, *o.trust)
         # What is left of exact data is the search's and rounding's.
         measured = misfit * size > max(_EXACT, _ROUNDINGS * eps) * o.scale() and np.isfinite(ratio)
         missed = is_given and o.trust == (1.0, None) and improbable((r[rows] ** 2).sum(), left)
-        x, wider = o.against[1], 1.0
-        factor, kind = shape_of(r[rows].reshape(len(x), -1)[np.argsort(x)]) if measured else (1.0, "")
-        if measured:  # a misfit that noise explains does not make a correlation larger
-            wider = max(o.trust[0] * factor * (ratio if missed else min(ratio, 1)) ** 2, 1.0)
+        order, wider = np.argsort(o.against[1]), 1.0
+        factor, kind = shape_of(r[rows].reshape(len(order), -1)[order]) if measured else (1.0, "")
+        if measured:
+            # A misfit that noise or the spacing explains does not make a correlation larger.
+            unknown = improbable((rest[rows] ** 2).sum(), left) if missed else bool(kind and not is_given)
+            strongest = strongest_mode(rest[rows].reshape(len(order), -1)) if unknown else 0.0
+            wider = max(o.trust[0] * factor * min(ratio, 1) ** 2, strongest, 1.0)
         factor, kind = (factor, kind) if wider > 1 else (1.0, "")
         freedom = np.inf if is_given else freedom
         of_noise.append((rows, 1.0, freedom))
@@ -266,6 +272,9 @@ def fit_result(
         wider = np.where(seen, each.error, 1) / np.where(seen, noise_alone.error, 1)
         ends = intervals(problem, z, each, gradient / wider**2, level)
         columns += [np.abs(np.asarray(slope, float)) * each.error, np.stack(ends, axis=1)]
+    # Few degrees of freedom of the noise are more beside what the grid adds: an interval is never the narrower for it.
+    (lower, upper), (lowest, highest) = columns[4].T, columns[6].T
+    columns[4] = np.stack([np.minimum(lower, lowest), np.maximum(upper, highest)], axis=1)
     numbers = zip(problem.labels, problem.owners, *(np.asarray(column).tolist() for column in columns), strict=True)
     reported = []
     for name, of in report.items():
@@ -276,10 +285,10 @@ def fit_result(
         number, start, both = float(value(z)), float(value(jnp.zeros_like(z))), []
         for each in (errors, noise_alone):
             error, freedom = each.of(np.asarray(jax.jacfwd(value)(z), float))
-            reach = float(quantile(level, freedom) * error)
-            both.append((float(error), (number - reach, number + reach)))
-        (error, ends), by_noise = both
-        reported.append(Estimate(name, number, error, ends, "", start, False, *by_noise))
+            both.append((float(error), float(quantile(level, freedom) * error)))
+        reach = max(by for _, by in both), both[1][1]
+        ends, alone = ((number - by, number + by) for by in reach)
+        reported.append(Estimate(name, number, both[0][0], ends, "", start, False, both[1][0], alone))
     degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
     texts = seen_together(problem.labels, errors, problem.logarithmic)
     result = FitResult(
@@ -308,9 +317,11 @@ def fit_result(
         moved=moved,
     )
     if result.p_value < IMPROBABLE:
+        share = 1 - (rest @ rest) / (r @ r)
+        alike = f", of whose square twice the spacing explains {share:.0%}" if isinstance(coarse, CoarseGrid) else ""
         texts.append(
-            f"The misfit is {np.sqrt(result.chi_squared / result.degrees_of_freedom):.2g} times the noise given: the "
-            "model or its discretisation does not explain the data. Errors are so many times those of the noise."
+            f"The misfit is {np.sqrt(result.chi_squared / result.degrees_of_freedom):.2g} times the noise given"
+            f"{alike}: the model or its discretisation does not explain the data. Errors hold it."
         )
     for n in noises:
         if n.shape:
