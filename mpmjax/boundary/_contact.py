@@ -49,7 +49,7 @@ class AbstractNodes(eqx.Module):
 
     mass: eqx.AbstractVar[NodeScalar]  # m_i [kg], shape (n,)
     conditions: eqx.AbstractVar[Conditions]  # the prescribed motion
-    dt: eqx.AbstractVar[Array]  # δt [s]
+    dt: eqx.AbstractVar[Array]  # Δt [s]
     potential: eqx.AbstractVar[Any]
     """The potential Φ of the nodes' displacement, with the mirrors of symmetry planes and of columns that are held."""
     contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]  # the boundaries that may be left
@@ -193,7 +193,7 @@ class AbstractSpringContact(AbstractContact):
 
     gap: eqx.AbstractVar[Array]  # g at u = 0 [m]
     stiffness: eqx.AbstractVar[Array]  # k [N/m], in the same shape
-    dt: eqx.AbstractVar[Scalar]  # δt [s]
+    dt: eqx.AbstractVar[Scalar]  # Δt [s]
     share: eqx.AbstractVar[Scalar]  # θ; 1 where forces are those at the start of the step
 
     def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:

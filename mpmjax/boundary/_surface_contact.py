@@ -74,7 +74,7 @@ class Faces(eqx.Module):
     shock adds."""
     stencil: Stencil  # the nodes of each particle
     spacing: Scalar  # dx [m]
-    dt: Scalar  # δt [s]
+    dt: Scalar  # Δt [s]
     push_time: Scalar  # the time at which surfaces push [s]: the start of an explicit step, the end of an implicit one
     share: Scalar = 1.0
     """θ, the share of the step's displacement at which the integrator evaluates forces; 1 at its start."""
