@@ -206,9 +206,9 @@ class SeparatingCollider(AbstractCollider):
 
     A fluid is held at a half-space across an axis as by a `SeparatingBox`, so that it stays at rest.
 
-    *When it breaks*: as a `SeparatingBox`. Fluids do not come to rest at other shapes. A body or
-    part of it that is thinner than two spacings does not keep material out, and one that moves through more than a
-    spacing in a step leaves some behind. Not in the total description.
+    *When it breaks*: as a `SeparatingBox`. Fluids do not come to rest at other shapes. A body or part of it that is
+    thinner than two spacings does not keep material out, and one that moves through more than a spacing in a step
+    leaves some behind. Not in the total description.
 
     Args:
         shape: the body before its motion.
