@@ -251,17 +251,18 @@ def fit_result(
         # What is left of exact data is the search's and rounding's.
         measured = misfit * size > max(_EXACT, _ROUNDINGS * eps) * o.scale() and np.isfinite(ratio)
         missed = is_given and o.trust == (1.0, None) and improbable((r[rows] ** 2).sum(), left)
-        order, wider = np.argsort(o.against[1]), 1.0
+        order, wider, strongest = np.argsort(o.against[1]), 1.0, 0.0
         factor, kind = shape_of(r[rows].reshape(len(order), -1)[order]) if measured else (1.0, "")
         if measured:
             # A misfit that noise or the spacing explains does not make a correlation larger.
             unknown = improbable((rest[rows] ** 2).sum(), left) if missed else bool(kind and not is_given)
-            strongest = strongest_mode(rest[rows].reshape(len(order), -1)) if unknown else 0.0
+            strongest = strongest_mode(rest[rows].reshape(len(order), -1)) if unknown else strongest
             wider = max(o.trust[0] * factor * min(ratio, 1) ** 2, strongest, 1.0)
         factor, kind = (factor, kind) if wider > 1 else (1.0, "")
         freedom = np.inf if is_given else freedom
         of_noise.append((rows, 1.0, freedom))
-        of_misfit.append((rows, wider, freedom if wider == 1 else max(left / factor, _LEAST_FREEDOM)))
+        # The strongest mode is a discrepancy's size, no variance that is known from few numbers.
+        of_misfit.append((rows, wider, freedom if wider in (1, strongest) else max(left / factor, _LEAST_FREEDOM)))
         beyond, worth = missed or bool(kind and not is_given), o.count / factor
         noises.append(NoiseEstimate(o.name, float(size), not is_given, float(misfit), o.count, worth, kind, beyond))
     held, slope = at_bound(r, J, np.asarray(problem.room(z))), jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1]
