@@ -256,8 +256,10 @@ def fit_result(
         if measured:
             # A misfit that noise or the spacing explains does not make a correlation larger.
             unknown = improbable((rest[rows] ** 2).sum(), left) if missed else bool(kind and not is_given)
-            strongest = strongest_mode(rest[rows].reshape(len(order), -1)) if unknown else strongest
-            wider = max(o.trust[0] * factor * min(ratio, 1) ** 2, strongest, 1.0)
+            weight = o.trust[0]  # the variance that noise alone has
+            if unknown:
+                strongest = weight * strongest_mode(rest[rows].reshape(len(order), -1) / np.sqrt(weight))
+            wider = max(weight * factor * min(ratio, 1) ** 2, strongest, 1.0)
         factor, kind = (factor, kind) if wider > 1 else (1.0, "")
         freedom = np.inf if is_given else freedom
         of_noise.append((rows, 1.0, freedom))
