@@ -15,7 +15,7 @@ from mpmjax.potential._wall_image import AbstractWallImage
 class SurfaceImage(AbstractWallImage):
     """The map of a surface (see `surface_image`). A node i that follows its parents k, with weights τ_ik, has
 
-        v_i = (1 − n_i n_iᵀ) Σ τ_ik v_k + n_i Σ τ_ik (ξ_i/ξ_k) n_k·v_k .
+    v_i = (1 − n_i n_iᵀ) Σ τ_ik v_k + n_i Σ τ_ik (ξ_i/ξ_k) n_k·v_k .
     """
 
     parents: Int[Array, "k n"]  # the numbers of each node's parents, shape (k, n)
