@@ -40,6 +40,10 @@ BOUNDARIES = {
         mpm.SlipCollider(mpm.HalfSpace((0.25, 0.2), (-2.0, -1.0))),
         mpm.StickyCollider(mpm.geometry.Capsule((0.0, 0.3), (0.1, 0.3), 0.06), MOVED),
     ),
+    "askew": (
+        mpm.SeparatingCollider(mpm.HalfSpace((0.05, 0.0), (2.0, 1.0)), MOVED, friction=0.3),
+        mpm.SeparatingCollider(mpm.Ball((0.1, -0.1), 0.24), friction=0.1),
+    ),
     "collider and contact plane": (
         mpm.ContactPlane(1, 0.0, friction=0.3),
         mpm.SeparatingCollider(mpm.HalfSpace((0.05, 0.0), (2.0, 1.0)), friction=0.3),
@@ -84,6 +88,7 @@ CASES = {
     "averaged volumes": {"volume": mpm.AveragedVolume(), "boundary": BOUNDARIES["planes"]},
     "midpoint-averaged volumes": {"volume": mpm.AveragedVolume(), "method": SECOND_ORDER["implicit_midpoint"]},
     "fluid": {"material": FLUIDS["fluid"], "boundary": BOUNDARIES["walls"]},
+    "fluid-askew": {"material": FLUIDS["fluid"], "boundary": BOUNDARIES["askew"]},
     "semi_implicit-fluid": {"material": FLUIDS["fluid"], "method": METHODS["semi_implicit"], "transfer": mpm.PIC()},
     **{
         f"{m}-viscous": {"material": VISCOUS["viscous_solid"], "method": method, "boundary": BOUNDARIES["walls"]}
@@ -118,6 +123,8 @@ CASES = {
 
 
 SLOW = {
+    "fluid-askew",
+    "explicit-askew",
     "semi_implicit-contact planes",
     "explicit-collider and contact plane",
     "explicit-colliders",

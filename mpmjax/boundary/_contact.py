@@ -32,16 +32,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._conditions import PARALLEL, Conditions, OwnedImpulse
-from mpmjax.potential import (
-    AbstractSpring,
-    AbstractTerm,
-    AbstractWallImage,
-    Displacement,
-    Mirror,
-    WallImage,
-    scattered,
-    with_one_mass,
-)
+from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Mirror, WallImage, scattered, with_one_mass
 
 ActiveSet = tuple[Bool[Array, "..."], ...]  # the places that are held, one mask for each contact
 
@@ -119,7 +110,7 @@ class AbstractContact(eqx.Module):
         Default: it may not be."""
         return False
 
-    def images(self, active: Array) -> tuple[AbstractWallImage, ...]:
+    def images(self, active: Array) -> tuple[Any, ...]:
         """The mirrors that stand in the places held. Default: none."""
         return ()
 
@@ -258,6 +249,11 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     """The number of the boundary of each wall among the images."""
 
     @property
+    def walls(self) -> list[tuple[int | None, Any]]:
+        """The walls among the images, which follow a scaling, with the numbers of their boundaries."""
+        return list(zip(self.held_by, self.images.images[1:], strict=True))
+
+    @property
     def mass(self) -> NodeScalar:
         """The nodes' mass, folded on the mirrors [kg], shape (n,)."""
         return self.nodes.mass
@@ -270,7 +266,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     def beyond_boundaries(self) -> tuple[Mask, tuple[NodeVector, ...]]:
         """The components of velocity on which no boundary acts, shape (n, d), and the normals that colliders hold."""
         free = self.unconstrained.free
-        reached = [image.reached(free.shape) for image in self.images.images if isinstance(image, AbstractWallImage)]
+        reached = [wall.reached(free.shape) for _, wall in self.walls]
         reached += [c.reached(a, free.shape) for c, a in zip(self.unconstrained.contacts, self.active, strict=True)]
         free = reduce(lambda free, held: free & ~held, reached, free)
         return free, tuple(jnp.where(free, normal, 0) for normal in self.nodes.projection.normals)
@@ -345,8 +341,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             by_order.append(by_contact)
         total = [reduce(jnp.add, each) / len(orders) for each in zip(*by_order, strict=True)]
         # v has been unfolded: its changes follow the walls, and are not scaled again
-        walls = Mirror(tuple(image for image in self.images.images if isinstance(image, AbstractWallImage)))
-        changes = tuple(map(walls.unfold, total))
+        changes = tuple(map(Mirror(self.images.images[1:]).unfold, total))
         return sum(changes, v), changes
 
 
@@ -356,7 +351,7 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     # those that hold every column come last: they fill in what lies behind them in columns that contacts release
     brought = [(number, contact.images(mask)) for number, (contact, mask) in zip(nodes.brought_by, pairs, strict=True)]
     each = [(number, wall) for number, walls in (*brought, *enumerate(nodes.walls)) for wall in walls]
-    walls = tuple(wall for _, wall in each)
+    walls = [wall for _, wall in each]
     fixed = nodes.conditions.fixed
     images, order, mass = with_one_mass(walls, nodes.mass, fixed) if walls else (Mirror(()), (), nodes.mass)
     fixed = reduce(jnp.logical_or, (contact.fixed(mask, fixed.shape) for contact, mask in pairs), fixed)

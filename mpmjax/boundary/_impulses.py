@@ -102,7 +102,7 @@ def owners_of(
     return owners
 
 
-def taken_by_mirrors(field: NodeVector, images: Sequence[tuple[int, Any]]) -> tuple[list[OwnedImpulse], NodeVector]:
+def taken_by_mirrors(field: NodeVector, images: Sequence[tuple[Any, Any]]) -> tuple[list[OwnedImpulse], NodeVector]:
     """The part of impulses on all nodes [kg m/s], shape (n, d), that mirrors take, and the impulses that remain on true
     nodes. The mirrors come in the order in which they unfold, with their boundaries' numbers.
 

@@ -19,8 +19,4 @@ from mpmjax.potential._term import (
     Forces as Forces,
     scattered as scattered,
 )
-from mpmjax.potential._wall_image import (
-    AbstractWallImage as AbstractWallImage,
-    WallImage as WallImage,
-    wall_image as wall_image,
-)
+from mpmjax.potential._wall_image import WallImage as WallImage, wall_image as wall_image

@@ -9,7 +9,7 @@ body together is such a map too.
 
 import abc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ from mpmjax.checks import require
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractMotion
 from mpmjax.potential._surface_image import SurfaceImage, one_mass
-from mpmjax.potential._wall_image import AbstractWallImage, WallImage
+from mpmjax.potential._wall_image import WallImage
 
 
 class MirrorPlace(NamedTuple):
@@ -157,16 +157,11 @@ class Scaling(AbstractImage):
         return field
 
     def vector(self, field: NodeVector) -> NodeVector:
-        return multiplied(self.factor, field)
-
-
-def multiplied(factor: Float[Array, "n d *d"], field: NodeVector) -> NodeVector:
-    """Each node's vector times factors of its components, or a matrix."""
-    return factor * field if factor.ndim == 2 else (factor * field[:, None]).sum(axis=2)
+        return self.factor * field if self.factor.ndim == 2 else (self.factor * field[:, None]).sum(axis=2)
 
 
 def with_one_mass(
-    walls: tuple[AbstractWallImage, ...], mass: NodeScalar, fixed: Mask
+    walls: Sequence[WallImage | SurfaceImage], mass: NodeScalar, fixed: Mask
 ) -> tuple["Mirror", tuple[int, ...], NodeScalar]:
     """The maps of walls, one or more, that hold nodes of these masses [kg], shape (n,), with a scaling before them; the
     numbers of the walls in the maps' order; and the masses folded by them. A node b before a wall across an axis has
@@ -211,14 +206,14 @@ class Tie(AbstractImage):
 class Mirror(eqx.Module):
     """The mirrors of several planes: `unfold` applies B, from true nodes to all nodes; `fold` applies Bᵀ."""
 
-    images: tuple[AbstractImage | AbstractWallImage, ...]  # the images at each plane, in their order
+    images: tuple[AbstractImage | WallImage | SurfaceImage, ...]  # the images at each plane, in their order
 
     def unfold(self, field: NodeVector) -> NodeVector:
         """B v: fill in the mirror images."""
         unfolded = field
         for image in self.images:
             unfolded = image.vector(unfolded)
-            unfolded = image.moved(unfolded, field) if isinstance(image, AbstractWallImage) else unfolded
+            unfolded = image.moved(unfolded, field) if isinstance(image, WallImage | SurfaceImage) else unfolded
         return unfolded
 
     def fold(self, field: NodeVector) -> NodeVector:
@@ -228,13 +223,13 @@ class Mirror(eqx.Module):
     def unscaled(self, field: NodeVector) -> NodeVector:
         """A velocity of true nodes, as that of which `unfold` makes it by its scaling."""
         for image in self.images:
-            field = multiplied(image.inverse, field) if isinstance(image, Scaling) else field
+            field = replace(image, factor=image.inverse).vector(field) if isinstance(image, Scaling) else field
         return field
 
     @property
-    def moving(self) -> tuple[Image | AbstractWallImage, ...]:
+    def moving(self) -> tuple[Image | WallImage | SurfaceImage, ...]:
         """The mirrors and walls that move."""
-        planes = (image for image in self.images if isinstance(image, Image | AbstractWallImage))
+        planes = (image for image in self.images if isinstance(image, Image | WallImage | SurfaceImage))
         return tuple(image for image in planes if image.velocity is not None)
 
     def added(self, field: NodeVector) -> NodeVector:
@@ -248,7 +243,7 @@ class Mirror(eqx.Module):
         """A velocity [m/s], shape (n, d), with 2V in its odd components beyond mirrors that move, and (1 − B) V behind
         walls that do. Where several mirrors reach, the first one holds, of walls the last."""
         images = self.moving
-        walls = [image for image in images if isinstance(image, AbstractWallImage)]
+        walls = [image for image in images if isinstance(image, WallImage | SurfaceImage)]
         for image in (*reversed([image for image in images if isinstance(image, Image)]), *walls):
             velocity = image.with_motion(velocity)
         return velocity

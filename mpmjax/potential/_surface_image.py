@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +10,9 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector
 from mpmjax.discretisation import BSpline, Grid, MLSGradient, make_stencil
-from mpmjax.potential._wall_image import AbstractWallImage
 
 
-class SurfaceImage(AbstractWallImage):
+class SurfaceImage(eqx.Module):
     """The map of a surface (see `surface_image`). A node i that follows its parents k, with weights τ_ik, has
 
     v_i = (1 − n_i n_iᵀ) Σ τ_ik v_k + n_i Σ τ_ik (ξ_i/ξ_k) n_k·v_k .
@@ -69,9 +69,11 @@ class SurfaceImage(AbstractWallImage):
         return jnp.where(self.follows[:, None], along + across[:, None] * self.normal, field)
 
     def fold_scalar(self, field: Array) -> Array:
+        """Bᵀ for an even scalar field, shape (n,), or for several in columns."""
         return jax.linear_transpose(self.scalar, field)(field)[0]
 
     def fold(self, field: NodeVector) -> NodeVector:
+        """Bᵀ for a vector field."""
         return jax.linear_transpose(self.vector, field)(field)[0]
 
     def fold_masses(self, masses: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
@@ -95,6 +97,7 @@ class SurfaceImage(AbstractWallImage):
         return jnp.broadcast_to(touched[:, None], shape)
 
     def carried(self, dim: int) -> Mask:
+        """All components of the nodes that follow, a mask of shape (n, d)."""
         return jnp.broadcast_to(self.follows[:, None], (len(self.height), dim))
 
     def with_motion(self, field: NodeVector) -> NodeVector:
@@ -103,6 +106,7 @@ class SurfaceImage(AbstractWallImage):
         return jnp.where(self.follows[:, None], self.velocity - self.vector(self.velocity), field)
 
     def moved(self, unfolded: NodeVector, field: NodeVector) -> NodeVector:
+        """As of a `WallImage`."""
         return unfolded if self.velocity is None else unfolded + jnp.where(self.follows[:, None], field, 0)
 
 

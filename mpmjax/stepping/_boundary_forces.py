@@ -15,7 +15,7 @@ from mpmjax.boundary import (
     taken_by_mirrors,
 )
 from mpmjax.discretisation import Gathered
-from mpmjax.potential import AbstractImage, AbstractWallImage, Image, Mirror
+from mpmjax.potential import Image, Mirror
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping._grid_update import GridUpdate, reaction
 from mpmjax.stepping._integrator import AbstractIntegrator
@@ -34,7 +34,7 @@ def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator,
     held, numbers = new.held(nodes), _boundaries_of_colliders(scene)
     holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
     parts = list(held.along_normals(holding))
-    of_walls, holding = taken_by_mirrors(held.without_collider_impulses(holding), _walls_of(held))
+    of_walls, holding = taken_by_mirrors(held.without_collider_impulses(holding), held.walls)
     for part in of_walls:
         if isinstance(part.owner, int) and part.owner in numbers:
             parts.append(replace(part, owner=numbers.index(part.owner)))
@@ -111,7 +111,7 @@ def impulse_on_boundaries(
     for part in held.along_normals(residual):
         parts.append(OwnedImpulse(part.impulse, jnp.where(part.owner < 0, -1, numbers[part.owner])))
         residual = residual - part.impulse
-    of_planes, residual = taken_by_mirrors(residual, _walls_of(held))
+    of_planes, residual = taken_by_mirrors(residual, held.walls)
     parts += [*of_planes, OwnedImpulse(residual, owners)]
     taken = owners >= 0
     for number, mine in _taken_by_contacts(held, taken):
@@ -138,12 +138,6 @@ def impulse_on_boundaries(
         places = places + force_at * dt * carried
         pivots = pivots + force_at * (_pivots(scene, t + dt, residual) - pivots)
     return received_impulses(parts, places, pivots, couples)
-
-
-def _walls_of(held: ConstrainedNodes[Nodes]) -> list[tuple[int, AbstractImage | AbstractWallImage]]:
-    """The walls that hold nodes, of contacts and those that are never left, with the numbers of their boundaries."""
-    each = zip(held.held_by, held.images.images[1:], strict=True)  # after the scaling
-    return [(number, wall) for number, wall in each if number is not None]
 
 
 def _taken_by_contacts(held: ConstrainedNodes[Nodes], taken: Mask) -> list[tuple[int, Mask]]:
