@@ -1,7 +1,7 @@
-"""The shell's `mpmjax`: its options, and what is refused before the package is imported.
+"""The shell's `mpmjax`: its options, and what is refused before a room of the package is imported.
 
-It stands outside of the package, whose import takes a second: who asks for help or errs waits less, and meanwhile
-Ctrl-C ends the command as quietly as SIGTERM does, not with a traceback of what was being imported.
+It imports no room until it needs one, which takes a second: who asks for help or errs waits less, and meanwhile Ctrl-C
+ends the command as quietly as SIGTERM does, not with a traceback of what was being imported.
 """
 
 import importlib
@@ -414,7 +414,3 @@ def example(
         print(f"written {target}")
     commands = re.findall(r"^# +((?:mpmjax|python) .*)$", (folder / names[0]).read_text(encoding="utf-8"), re.MULTILINE)
     print("\n".join(commands or [f"python examples/{names[0]}"]))
-
-
-if __name__ == "__main__":  # `python -m mpmjax_command`, the command without its script
-    main()
