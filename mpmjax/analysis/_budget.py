@@ -42,7 +42,7 @@ def energy_of(scene: Scene, particles: Particles) -> Energy:
         speed2 = speed2 + (particles.C**2 * scene.stencil(particles).moment.T[:, None, :]).sum(axis=(1, 2))
     kinetic = particles.mass * speed2 / 2
     for constraint in scene.constraints:
-        rows = slice(*particles.groups[constraint.number].rows)
+        rows = particles.groups[constraint.number].rows
         fields = (particles.x, particles.v, particles.mass, particles.volume)
         kinetic = kinetic.at[rows].set(0).at[rows.start].set(constraint.kinetic_energy(*(a[rows] for a in fields)))
     gravity = jnp.asarray(scene.gravity, particles.x.dtype)

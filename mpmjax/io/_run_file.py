@@ -26,7 +26,7 @@ from mpmjax.checks import canonical, require
 from mpmjax.io._schema import decode, encode
 from mpmjax.io._transactional_file import StagedFile, reason, require_no_writer
 from mpmjax.simulation import Problem
-from mpmjax.state import Scene, State, by_material, history_arrays
+from mpmjax.state import Scene, State, history_arrays
 from mpmjax.stepping import AbstractIntegrator
 
 File = Any  # an `h5py.File`, whose own annotations do not say what a name leads to
@@ -286,8 +286,8 @@ def rows_of(frame: int, time: float, state: State, fields: Mapping[str, Any]) ->
     p, d = x.shape
     flat = ((0, 0), (0, 3 - d))
     ratios, gradients = [], []
-    k = max((stored.shape[1] for _, stored, _ in by_material(state) if stored.ndim > 1), default=d)
-    for _, stored, _ in by_material(state):
+    k = max((stored.shape[1] for _, stored, _ in state.groups if stored.ndim > 1), default=d)
+    for _, stored, _ in state.groups:
         alone, a = stored.ndim == 1, np.asarray(stored)
         ratios.append(a if alone else np.linalg.det(a) if d > 1 else a[:, 0, 0])
         gradients.append(a[:, None, None] ** (1 / k) * np.eye(k, dtype=a.dtype) if alone else a)
@@ -334,7 +334,7 @@ def states_in(rows: dict[str, np.ndarray], like: State) -> State:
         taken("VTKHDF/Points", 3)[..., :d],
         taken("VTKHDF/PointData/velocity", 3)[..., :d],
         None if like.C is None else tensors("affine_velocity")[..., :d, :d],
-        tuple((J if a.ndim == 1 else F[..., : a.shape[1], : a.shape[1]])[:, of] for of, a, _ in by_material(like)),
+        tuple((J if a.ndim == 1 else F[..., : a.shape[1], : a.shape[1]])[:, of] for of, a, _ in like.groups),
         jax.tree.unflatten(jax.tree.structure(like.histories), history),
         *masses,
     )

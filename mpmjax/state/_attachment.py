@@ -90,9 +90,8 @@ class AttachedPoints(AbstractPlace):
         if self.area is None:
             return self
         rows, groups = np.atleast_2d(np.asarray(self.particle))[0].astype(int), particles.groups
-        hoop = np.concatenate(
-            [np.ones(q.rows[1] - q.rows[0]) if q.stored is None else q.stored[:, 2, 2] for q in groups]
-        )
+        sizes = zip(groups, particles.sizes, strict=True)
+        hoop = np.concatenate([np.ones(n) if q.stored is None else q.stored[:, 2, 2] for q, n in sizes])
         length = 2 * np.pi * np.asarray(self.place)[:, 0] / hoop[rows]
         return eqx.tree_at(lambda p: (p.weight, p.area), self, (self.weight * length, self.area * length[:, None]))
 

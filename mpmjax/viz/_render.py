@@ -13,7 +13,7 @@ from mpmjax.analysis import FIELDS, smoothed, volume_ratio
 from mpmjax.checks import between, canonical, checked, require, require_between, require_memory
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
-from mpmjax.state import Particles, Scene, by_material, history_arrays
+from mpmjax.state import Particles, Scene, history_arrays
 from mpmjax.viz._pixels import disks, film_pictures, write_film
 
 COLOURS: dict[str, tuple[str, Callable[[Scene, Particles], Any]]] = {
@@ -170,8 +170,8 @@ def _legend(axes: Any, scene: Scene) -> None:
 def _tinted(particles: Particles, bar: Any, values: np.ndarray) -> np.ndarray:
     """The particles' colours, (p, 3): by their values, and where there are none by their material."""
     colours = np.empty((particles.count, 3))
-    for i, (rows, *_) in enumerate(by_material(particles)):
-        colours[rows] = _colour_of(i, particles.dim)
+    for i, group in enumerate(particles.groups):
+        colours[group.rows] = _colour_of(i, particles.dim)
     if bar is None:
         return colours
     return np.where(np.isnan(values)[:, None], colours, bar.to_rgba(values)[:, :3])
@@ -395,7 +395,7 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
     def draw(particles: Particles, values: np.ndarray, t: float) -> list[Any]:
         place, F = np.zeros((particles.count, 2)), np.tile(np.eye(2), (particles.count, 1, 1))
         place[:, :d] = particles.x
-        for (rows, stored, _), law in zip(by_material(particles), run.scene.laws, strict=True):
+        for (rows, stored, _), law in zip(particles.groups, run.scene.laws, strict=True):
             a = np.asarray(stored)
             F[rows, :d, :d] = a[:, :d, :d] if a.ndim == 3 else a[:, None, None] ** (1 / d) * np.eye(d)
             F[rows] *= 2.0 if a.ndim == 1 or law.relaxes_stress else 1.0  # F does not say how they are stretched
