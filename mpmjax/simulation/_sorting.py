@@ -63,10 +63,9 @@ def memory_order(scene: Scene, particles: Particles, steps: int) -> MemoryOrder 
     """The order in which prepared particles were given, which `resorted` will change; None if they stay in it.
 
     Particles are sorted in the updated description, with native sums, if a law yields or flows: bodies that only deform
-    keep their order. A body force may know particles by their numbers, so with one they stay as they are. With the
-    environment variable MPMJAX_ORDER=given they always do, and with another value a ValueError is raised; it is read
-    when a program is compiled. `steps` are those of the run, or between two saved frames.
-    """
+    keep their order. So does a scene with a body force, which may know particles by their numbers, and all with the
+    environment variable MPMJAX_ORDER=given, read when a program is compiled. `steps` are those of the run, or between
+    two saved frames."""
     asked = os.environ.get(VARIABLE, "")
     if asked not in ("", "given"):
         raise ValueError(f"{VARIABLE} must be given, or not be set, got {asked!r}.")

@@ -2,6 +2,7 @@
 step: how the nodes move them, and how forces on them reach the nodes."""
 
 import abc
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -319,9 +320,7 @@ class LoadedPoints(eqx.Module):
         F = self.deformation
         if F is not None and self.rate is not None:
             F = F + time * self.rate
-        return eqx.tree_at(
-            lambda p: (p.x, p.deformation), self, (self.x + time * self.v, F), is_leaf=lambda leaf: leaf is None
-        )
+        return replace(self, x=self.x + time * self.v, deformation=F)
 
     def displacement(self, moved: Displacement) -> Float[Array, "d s"]:
         """Σ_i N_is u_i, of a displacement or velocity of the nodes."""
