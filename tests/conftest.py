@@ -28,7 +28,8 @@ def pytest_configure(config: Any) -> None:
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     with install_import_hook("mpmjax", "annotations.checked"):
-        import mpmjax  # noqa: F401
+        import mpmjax.extensions
+        import mpmjax.stepping  # noqa: F401
     # tracing makes many objects, few of them in cycles: looking for those took a twelfth of the time
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
