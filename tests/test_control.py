@@ -136,6 +136,8 @@ def test_a_run_goes_on_from_its_memory_and_its_file(whole, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, ended.final, whole.final)
     jax.tree.map(np.testing.assert_array_equal, ended.final_memory, whole.final_memory)
     mpm.save(tmp_path / "saved.vtkhdf", whole)
+    with pytest.raises(ValueError, match=r"control is 'unknown' .* go on by simulate"):
+        mpm.record(tmp_path / "saved.vtkhdf", scene, particles, t1=12 * DT, dt=DT, save_every=4, resume=True, **of)
     for name in ("run", "saved"):
         run = mpm.load(tmp_path / f"{name}.vtkhdf")
         jax.tree.map(np.testing.assert_array_equal, run.frames, whole.frames)

@@ -421,6 +421,26 @@ def test_a_search_that_ends_where_simulations_begin_to_fail_has_not_converged():
     assert (among.converged, len(among.history)) == (False, len(alone.history))
 
 
+class Saturated(Failing):
+    """r = 100 (z_0 + 1), 100 (s(z_1) − ½) with a sigmoid s that has a slope of 0.0017 at the start."""
+
+    def __init__(self):
+        super().__init__(jnp.inf)
+        self.names, self.parameters, self.starts = ("a", "b"), (STIFFNESS,) * 2, (jnp.ones(()),) * 2
+
+    def jacobian(self, z, sigmas, mode=None):
+        residuals = lambda z: 100 * jnp.stack([z[0] + 1, jax.nn.sigmoid(3 * (z[1] + 2.5)) - 0.5])  # noqa: E731
+        return residuals(z), jax.jacfwd(residuals)(z)
+
+
+def test_no_step_goes_where_a_straight_line_cannot_know():
+    """The first Gauss-Newton step, to z = −300, would lower Σ r² by the other number, where this one is not seen."""
+    found = search(Saturated(), mpm.fitting.LevenbergMarquardt(), jnp.zeros(2), ())
+    assert found.converged
+    assert np.allclose(found.z, [-1, -2.5], atol=1e-5)
+    assert len(found.history) < 15
+
+
 class Rounded(Failing):
     """r = 100 + x (z − 1) + z²/1000 and a rounding of single precision that its derivative does not know."""
 

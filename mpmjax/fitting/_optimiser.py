@@ -22,7 +22,9 @@ class LevenbergMarquardt(AbstractOptimiser):
     """The Levenberg-Marquardt method: steps −(JᵀJ + λ)⁻¹ Jᵀ r of the residuals r and their Jacobian J.
 
     λ is first one, the square of a coordinate's natural step; it falls by 3.5 where a step lowers Σ r² as foretold, and
-    grows fourfold where one does not lower it by a hundredth of that, or a simulation fails: that one is not taken.
+    grows fourfold where one does not lower it by a hundredth of that, or a simulation fails: that one is not taken. It
+    is larger where a number with a bound would move by more than 2 in its coordinate, a modulus sevenfold, or a quarter
+    of that for each refusal before: so far no straight line knows the way.
 
     Near a bound the coordinate hides the value from it: the damping then holds a step that the data ask for. There the
     next one is the Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds.
@@ -76,7 +78,11 @@ class LevenbergMarquardt(AbstractOptimiser):
         if not np.isfinite(J).all():
             return z, state, seen
         U, lengths, Vt = np.linalg.svd(J, full_matrices=False)
-        step = -Vt.T @ (lengths / (lengths**2 + 1 / np.clip(reach, *_REACHES)) * (U.T @ r))
+        damping = 1 / np.clip(reach, *_REACHES)
+        damping = np.append(damping, np.maximum(damping, lengths[0] ** 2 * np.logspace(-16, 4, 81)))
+        steps = -Vt.T @ ((lengths * (U.T @ r))[:, None] / (lengths[:, None] ** 2 + damping))
+        short = (np.abs(steps[_bounded(seen)]) <= _FURTHEST / _SHORTER**refused).all(axis=0)
+        step = steps[:, short.argmax() if short.any() else -1]
         wanted = np.abs(np.linalg.lstsq(J, -r)[0]).max()
         held = wanted > _FAR * tolerance and np.abs(step).max() < _REFUSED * wanted
         if not refused and (straight := _to_a_bound(seen, step)) is not None:
@@ -133,11 +139,20 @@ def _to_a_bound(seen: Evaluation, damped: np.ndarray) -> np.ndarray | None:
     if not np.isfinite(step).all():
         return None
     (down, up), square = np.asarray(seen.room, float), np.maximum((J**2).sum(axis=0), np.finfo(float).tiny)
-    near = square * np.minimum(down, up) ** 2 <= _HIDDEN**2 * (r**2).sum() / max(len(r) - len(step), 1)
+    left, now = ((r + J @ step) ** 2).sum(), (r**2).sum()
+    near = square * np.minimum(down, up) ** 2 <= _HIDDEN**2 * left / max(len(r) - len(step), 1)
+    near &= left > now / 2  # else Σ r² is no noise yet, and says nothing of errors
     side = np.where(down < up, 1, -1)
     straight = side * np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1))
     wanted = np.where(near, straight, step)
-    return wanted if (near & (np.abs(damped) < np.abs(wanted) / 2)).any() else None
+    held, far = near & (np.abs(damped) < np.abs(wanted) / 2), ~near & _bounded(seen) & (np.abs(step) > _FURTHEST)
+    return wanted if held.any() and not far.any() else None
+
+
+def _bounded(seen: Evaluation) -> np.ndarray:
+    """Which numbers have a bound, and so coordinates in which they are bent."""
+    down, up = np.isfinite(np.asarray(seen.room))
+    return down | up
 
 
 def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -363,6 +378,7 @@ _LONGER, _SHORTER = 3.5, 4.0  # factors of the reach where a step was as foretol
 _REACHES = 1e-300, 1e300
 _FAR = 100.0  # a step is short below so many tolerances
 _REFUSED = 0.1  # part of the Gauss-Newton step below which a step is held back
+_FURTHEST = 2.0  # longest step of a coordinate with a bound [-]
 _LEAP = 9.0  # longest step to a bound [-]: to a ten-thousandth of the distance from it
 _HIDDEN = 3.0  # standard errors from a bound within which a coordinate is near it
 _NEGLIGIBLE = 1e-4  # a step of so many standard errors is none

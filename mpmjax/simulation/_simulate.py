@@ -65,9 +65,9 @@ def simulate(
 ) -> Run:
     """Simulate a scene from step `start` to time t1 in steps of dt.
 
-    The rollout is differentiable with respect to every float of the scene, the particles and the method: in reverse
-    mode by default, within `checkpoint_bytes`; in forward mode (`jax.jvp`, `jax.jacfwd`) with
-    `adjoint=diffrax.ForwardMode()`. Only the number of steps, `save_every` and choices of code compile anew.
+    The rollout is differentiable by every float of scene, particles and method: in reverse mode by default, in forward
+    mode (`jax.jvp`, `jax.jacfwd`) with `adjoint=diffrax.ForwardMode()`. Only the number of steps, `save_every` and
+    choices of code compile anew.
 
     Args:
         scene: the scene.
@@ -77,11 +77,10 @@ def simulate(
             a whole number (`run.dt` says it). What stretches or stiffens on the way may need a shorter one.
         method: update of the grid velocity.
         save_every: save the state at the start, every so many steps, and at the end. Default: only `final` is returned.
-        observe: instead of states, save what this function of (scene, particles) returns, so that a curve costs no more
-            memory than its points. `save_every` then defaults to 1. It may be an `equinox.Module` with arrays; a plain
-            function compiles anew unless it is the same object.
-        start: number of the first step, e.g. a former run's `final_step`; time there is start·dt. The impulse on
-            colliders and boundaries (`run.collider_impulse`) is summed from here on in any run.
+        observe: instead of states, save what this function of (scene, particles) returns, by default at every step. An
+            `equinox.Module` may hold arrays; a plain function compiles anew unless it is the same object.
+        start: number of the first step, e.g. a former run's `final_step`; time there is start·dt. Impulses are summed
+            from here on.
         adjoint: how diffrax differentiates. Default: reverse mode by segments of steps.
         checkpoint_bytes: memory for what reverse mode stores by default [B]. With less of it steps are computed again,
             once if it is enough for the square root of their number.
@@ -89,21 +88,18 @@ def simulate(
         throw: raise on faults. False puts them into `statistics`, and a failed batch member leaves others alone.
         control: a pure function `(scene, particles, t, dt, memory) -> (scene, particles, memory)`, called before each
             step: the scene that it returns has other numbers in this step (accelerations, motions of boundaries), the
-            particles that it returns go on from there (activations, particles that enter or leave), and so does the
-            memory. Weights that are trained are arrays of an `equinox.Module`. See docs/control.md.
+            particles go on from there (activations, what enters or leaves), and so does the memory. Weights that are
+            trained are arrays of an `equinox.Module`. See docs/control.md.
         memory: the control's memory at the start, a pytree of floats; e.g. a former run's `final_memory`.
 
     Raises:
         ValueError: of `prepare`; a value of the method that it does not allow; a t1 not whole steps after the start.
-        SimulationError: a state that is not finite, a particle outside the window, an F that the law does not allow,
-            a particle that has collapsed (a stretch below a hundredth, in the updated description) or that passed a
-            boundary (each with step, time and first bad particle; the last good state is in its `run.final`, for which
-            the run is computed once more up to it), a solve that ended beyond ten times its tolerance; one that ended
+        SimulationError: a `Fault`, with step, time and first bad particle (its `run.final` is the last good state, for
+            which the run is computed once more), or a solve that ended beyond ten times its tolerance; one that ended
             nearer is a Python warning.
         RuntimeError: the same, and values that scene, particles or method do not allow, under an outer transformation
-            (`jax.jit`, `jax.grad`, `jax.vmap` and what is made of them, where only the derivative is asked for too);
-            and a tangent or adjoint solve that did not converge. Of compiled programs its text ends with the line that
-            says what is wrong. With `throw=False` such values make the state NaN and such a solve the derivative.
+            (`jax.jit`, `jax.grad`, `jax.vmap`); and a tangent or adjoint solve that did not converge. Of compiled
+            programs its last line says what is wrong. With `throw=False` the state or the derivative is NaN then.
     """
     start = require_whole("start", start, 0)
     dtype = particles.x.dtype
@@ -168,8 +164,8 @@ def rollout(
     control: Control | None = None,
     memory: Any = None,
 ) -> Particles:
-    """The plain rollout: `jax.lax.scan` over steps, without saving or checks. Tests compare `simulate` with it. Reverse
-    mode stores the state before each step and the solutions of implicit solves, and computes the rest again.
+    """The plain rollout: `jax.lax.scan` over steps, without saving or checks. Reverse mode stores the state before each
+    step and the solutions of implicit solves, and computes the rest again.
 
     Args:
         scene, particles, method, start, control, memory: as in `simulate`.
@@ -257,11 +253,8 @@ def integrate(
     watch: bool = True,
 ) -> End:
     """Integrate `count` ≤ `max_steps` steps from a problem's start, at which the particles have this state. With
-    `watch` the run stops at a fault, and `until` so many steps.
-
-    Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it
-    compiles, and not a program of two thousand operations.
-    """
+    `watch` the run stops at a fault, and `until` so many steps. Without a count, all of them: what diffrax derives of
+    its last time is then a constant to XLA, and not a program of two thousand operations."""
     scene, particles, start, save_every = problem.scene, problem.particles, problem.start, problem.save_every
     dtype = particles.x.dtype
     zero, one, all_steps = (np.asarray(n, dtype) for n in (0, 1, max_steps))

@@ -87,7 +87,7 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
         )
     side = volume ** (1 / d)
     for number, group in enumerate(particles.groups, 1):
-        rows = slice(*np.searchsorted(there, group.rows))
+        rows = slice(*np.searchsorted(there, (group.rows.start, group.rows.stop)))
         if rows.start == rows.stop:
             continue
         half = side[rows, None] / 2

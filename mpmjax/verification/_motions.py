@@ -41,11 +41,6 @@ class AxisAligned(AbstractProblem):
     material: AbstractMaterial = NeoHookean(1e7, 0.3)
     density: float = 1e3
 
-    @property
-    def duration(self) -> float:
-        """One period, 2/c [s]."""
-        return 2 / float(self.bar_speed)
-
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         phase = jnp.pi * jnp.asarray(_PHASES[self.dim], X.dtype)
         return X + self.amplitude * jnp.sin(jnp.pi * X) * jnp.sin(jnp.pi * self.bar_speed * t + phase)
@@ -126,11 +121,6 @@ class ExpandingRing(AbstractProblem):
     material: AbstractMaterial = NeoHookean(1e7, 0.0)
     density: float = 1e3
     dim: int = eqx.field(static=True, default=2)  # space dimension
-
-    @property
-    def duration(self) -> float:
-        """One period, 2/c [s]."""
-        return 2 / float(self.bar_speed)
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         a, b = self.inner, self.outer
