@@ -27,6 +27,7 @@ def pytest_configure(config: Any) -> None:
         return
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
+    jax.config.update("jax_traceback_in_locations_limit", 0)  # no lines of Python in programs: a thirtieth of the time
     with install_import_hook("mpmjax", "annotations.checked"):
         import mpmjax.extensions
         import mpmjax.stepping  # noqa: F401

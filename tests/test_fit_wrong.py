@@ -13,6 +13,9 @@ from test_fit import DT, NOISE, RATIO, experiment, tracks
 import mpmjax as mpm
 from mpmjax.fitting._discretisation import CoarseGrid, unexplained
 from mpmjax.fitting._estimate import shape_of, strongest_mode
+from mpmjax.fitting._evaluation import Evaluation
+from mpmjax.fitting._result import fit_result
+from mpmjax.fitting._search import Search
 from mpmjax.verification import StandingWave, discretise
 
 E, SIDE = 7e4, 0.4
@@ -115,6 +118,13 @@ def test_residuals_that_are_no_noise_are_named(both_grids):
             assert stiff.error == pytest.approx(np.sqrt(wider if shape else 1) * stiff.noise_error, rel=0.01)
             assert f"{seen.worth:.2g} independent numbers" in table or not shape
             assert seen.is_beyond == (bool(shape) if sigma is None else shape == "a ramp")
+            if sigma is None:  # a weight of all data alike changes no error, whatever the misfit
+                problem = eqx.tree_at(lambda p: p.experiments[0].observations[0].weight, found.problem, 4.0)
+                known = Evaluation(0.0, found.z, 2 * found.residuals, 2 * found.jacobian)
+                end = Search(jnp.asarray(found.z), None, known, (), converged=True)
+                settled = [(*found.sigmas, 1.0, float(found.degrees_of_freedom))]
+                weighted = fit_result(problem, found.optimiser, end, settled, {}, found.level)
+                assert weighted["E"].error == pytest.approx(stiff.error, rel=1e-6)
 
 
 def test_correlated_numbers_are_worth_what_theory_says():

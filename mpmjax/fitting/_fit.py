@@ -17,6 +17,7 @@ from mpmjax._types import Scalar
 from mpmjax.checks import between, checked, require, warn
 from mpmjax.fitting._discretisation import look_at_coarse_grid
 from mpmjax.fitting._estimate import table
+from mpmjax.fitting._evaluation import Evaluation
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._log import recorded
 from mpmjax.fitting._optimiser import LBFGS, LevenbergMarquardt
@@ -26,7 +27,6 @@ from mpmjax.fitting._result import FitResult, Noise, fit_result, settle_noise
 from mpmjax.fitting._search import (
     NO_DERIVATIVE,
     AbstractOptimiser,
-    Evaluation,
     Iteration,
     Search,
     batch_size,
@@ -115,19 +115,23 @@ def fit(
     starting_points(problem, unit_points(0, problem.size, 0), starts)  # those that cannot be are refused
     zeros, say, paired = jnp.zeros(problem.size, problem.dtype), progress or (lambda text: None), set[str]()
     with recorded(problem, optimiser, progress, None if log is None else Path(log), resume=resume) as (past, record):
-        first, earlier, sigmas, state = (0, (), problem.first_sigmas, None) if past is None else past
+        rounds, earlier, sigmas, state = (0, (), problem.first_sigmas, None) if past is None else past
 
-        def begun(noise: Sigmas, seen: Evaluation) -> None:
-            """Name what the data do not see, or not apart, by the first Jacobian."""
-            require_influence(problem, noise, seen)
-            if seen.jacobian is not None and not paired:
-                errors = uncertainty(np.asarray(seen.jacobian, float), float(jnp.finfo(problem.dtype).eps), ())
+        def iterated(noise: Sigmas, search: Search) -> None:
+            """Record an iteration; the first one names what the data do not see, or not apart."""
+            J = search.seen.jacobian
+            first = search.history[-1].number == 0
+            if first:
+                require_influence(problem, noise, search.seen)
+            if first and J is not None and not paired:
+                errors = uncertainty(np.asarray(J, float), float(jnp.finfo(problem.dtype).eps), ())
                 for text in seen_together(problem.labels, errors, problem.logarithmic):
                     paired.add(text.split(":")[0])
                     warn(f"At the first guess, {text}")
                     say(f"at the first guess, {text}")
+            record(noise, search)
 
-        descend = partial(_in_rounds, [problem], optimiser=optimiser, begun=begun, report=record)
+        descend = partial(_in_rounds, [problem], optimiser=optimiser, report=iterated)
 
         def resulted(end: Search, settled: Noise | None) -> FitResult | None:
             return None if settled is None else fit_result(problem, optimiser, end, settled, report, level)
@@ -139,7 +143,7 @@ def fit(
             result = resulted(end, settle_noise(problem, end, noise)[0])
             return result is not None and not result.is_beyond
 
-        ((end, settled, changing, noise),) = descend([sigmas], starts={0: zeros}, rounds=first, state=state)
+        ((end, settled, changing, noise),) = descend([sigmas], starts={0: zeros}, rounds=rounds, state=state)
         result = resulted(end, settled)
         history = (*earlier, *end.history)
         # The log of a fit that other starts have brought farther holds a search that begins where none ended.

@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from operator import attrgetter
 from typing import Any
 
 import jax
@@ -51,7 +50,7 @@ class FitResult(AbstractFit):
     sigmas: Sigmas  # the noise of each observation, given or estimated, in the data's unit
     residuals: np.ndarray  # residuals of all observations, then of priors, in units of their noise [-], shape (m,)
     jacobian: np.ndarray  # their derivative by the coordinates, shape (m, n)
-    uncertainty: Uncertainty  # covariance of the coordinates, and the directions that the data do not see
+    uncertainty: Uncertainty  # covariance, correlation, Fisher spectrum and its directions
     estimates: tuple[Estimate, ...]  # the fitted numbers, one for each entry of each parameter
     reported: tuple[Estimate, ...]  # the estimates that `report` asked for
     chi_squared: float  # Σ r², priors included
@@ -75,14 +74,6 @@ class FitResult(AbstractFit):
     def values(self) -> dict[str, np.ndarray]:
         """The value of each parameter, in its shape."""
         return self.problem.by_name(jnp.asarray(self.z, self.problem.dtype))
-
-    covariance = property(attrgetter("uncertainty.covariance"), doc="Covariance of the coordinates [-], shape (n, n).")
-    correlation = property(attrgetter("uncertainty.correlation"), doc="Correlation of the estimates, shape (n, n).")
-    spectrum = property(
-        attrgetter("uncertainty.spectrum"),
-        doc="Eigenvalues of the Fisher information JᵀJ, growing, shape (n,): 1/√λ is how far the direction is open.",
-    )
-    directions = property(attrgetter("uncertainty.directions"), doc="Their eigenvectors, one a column, shape (n, n).")
 
     @property
     def all(self) -> tuple[Estimate, ...]:

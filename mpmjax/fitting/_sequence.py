@@ -22,7 +22,7 @@ from mpmjax.fitting._observation import Series
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import FitResult
-from mpmjax.fitting._search import AbstractOptimiser, begin, iterate, jacobian, search
+from mpmjax.fitting._search import AbstractOptimiser, jacobian, search
 from mpmjax.fitting._starts import Starts, as_starts
 from mpmjax.fitting._uncertainty import quantile
 
@@ -87,7 +87,7 @@ def fit_staged(
     limits = _limits(problem.at(z), float(growth))
     whole = _cut(problem, limits, end)
     if times is None:
-        first = _first_horizon(whole, optimiser, z)
+        first = _first_horizon(whole, z)
         times = [first * 2.0**k for k in range(_MOST_STAGES) if first * 2.0**k < _NEARLY_ALL * end]
         tell(
             f"The first horizon is {first:.4g} s of {end:.4g} s: until then a change of one in a coordinate changes "
@@ -142,14 +142,12 @@ def _limits(experiments: Sequence[Experiment], growth: float) -> list[float]:
     return limits
 
 
-def _first_horizon(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates) -> float:
+def _first_horizon(problem: FitProblem, z: Coordinates) -> float:
     """The time until which the data are nearly linear in the coordinates [s], see `fit_staged`."""
-    sigmas, start = problem.first_sigmas, z.astype(float)
-    _, _, seen = iterate(problem, optimiser, start, sigmas, begin(problem, optimiser, start, sigmas))
-    if not np.isfinite(seen.cost):
+    sigmas, parts = problem.first_sigmas, []
+    r, J = (np.asarray(a, float) for a in jacobian(problem, z, sigmas))
+    if not np.isfinite(r).all():
         problem.explain(z)
-    J = np.asarray(jacobian(problem, z, sigmas)[1] if seen.jacobian is None else seen.jacobian, float)
-    parts = []
     for o, rows, sigma in zip(problem.observations, problem.rows, sigmas, strict=True):
         if isinstance(o, Series):
             change = (J[rows] ** 2).reshape(len(o.times), -1, problem.size).sum(axis=1)

@@ -145,14 +145,15 @@ def _numbers(
 ) -> dict[str, Any]:
     observations = [o for e in measured or result.experiments for o in e.observations]
     predictions = predict_observations(result, measured or None) if predictions is None else predictions
-    plain = ("correlation", "chi_squared", "p_value", "degrees_of_freedom", "level", "converged", "interrupted")
+    plain = ("chi_squared", "p_value", "degrees_of_freedom", "level", "converged", "interrupted")
     bands = ("value", "error", "lower", "upper", "sigma", "new_lower", "new_upper")
     of_profile = ("label", "interval", "threshold", "degrees_of_freedom", "level", "warnings")
     return {
         "estimates": [e._asdict() for e in result.all],
-        "fisher_spectrum": result.spectrum,
-        "covariance_of_coordinates": result.covariance,
-        "fisher_directions": result.directions,
+        "correlation": result.uncertainty.correlation,
+        "fisher_spectrum": result.uncertainty.spectrum,
+        "covariance_of_coordinates": result.uncertainty.covariance,
+        "fisher_directions": result.uncertainty.directions,
         **{name: getattr(result, name) for name in plain},
         "noise": [n._asdict() for n in result.noise],
         "predictions": [
