@@ -357,9 +357,8 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
         zero = jnp.zeros(1, particles.x.dtype)
         problem = Problem(scene, particles, zero[0], Explicit())
         state = initial_state(problem)
-        frames = jax.tree.map(lambda a: a[None], state.particles)
-        shown = run_to(problem, state, 0, no_steps(particles.x.dtype), steps=zero, frames=frames)
-        render(shown, plot, colour=None)
+        frames = jax.tree.map(lambda a: a[None], state)
+        render(run_to(problem, state, 0, no_steps(particles.x.dtype), frames, steps=zero), plot, colour=None)
         say("written", str(plot))
 
 

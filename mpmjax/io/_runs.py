@@ -270,17 +270,7 @@ def load(path: str | os.PathLike, *, frame: int | None = None) -> Run:
         steps, frames, tallies = frames_in(file, like, start, stop)
         _check_numbers(scene, described["dt"], steps, frames.particles)
     last, statistics = at((frames, tallies), -1)
-    return run_to(
-        problem,
-        last,
-        steps[-1],
-        statistics,
-        steps=canonical(steps, dtype),
-        frames=frames.particles,
-        collider_impulse=frames.collider_impulse,
-        boundary_impulse=frames.boundary_impulse,
-        memory=frames.memory,
-    )
+    return run_to(problem, last, steps[-1], statistics, frames, steps=canonical(steps, dtype))
 
 
 @checked

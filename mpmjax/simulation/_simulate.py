@@ -35,6 +35,7 @@ from mpmjax.simulation._diffrax import (
     faulty_particles,
     gravest,
     initial_state,
+    run_to,
 )
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
 from mpmjax.simulation._run import Fault, Run, RunStatistics
@@ -139,9 +140,8 @@ def simulate(
     problem = Problem(scene, particles, dt_, method, start=first, **held)
     go = partial(integrate, problem, begin, max_steps=count, adjoint=adjoint, progress=progress, watch=not traced)
     end = go(until=np.asarray(np.inf, dtype))
-    names = ("frames" if observe is None else "observed", "collider_impulse", "boundary_impulse", "memory")
-    saved = dict(zip(names, end.saved, strict=True)) | {"steps": end.steps, "report": end.report if traced else None}
-    run = run_to(problem, end.state, end.step, end.statistics, **saved)
+    saved = {"steps": end.steps, "observed": end.observed, "report": end.report if traced else None}
+    run = run_to(problem, end.state, end.step, end.statistics, end.frames, **saved)
     if not throw:
         return run
     if traced:
@@ -231,9 +231,8 @@ class End(NamedTuple):
     """The end of an integration."""
 
     steps: Float[Array, "f"]  # numbers of the saved frames; none if nothing was saved
-    saved: Any
-    """The frames, along a first axis: of each its state or what was observed, the impulses on colliders and on
-    boundaries, and the control's memory."""
+    frames: RolloutState | None  # them, along a first axis, without particles where something is observed instead
+    observed: Any  # likewise
     state: RolloutState
     step: Float[Array, ""]  # the number of the last step
     statistics: RunStatistics
@@ -275,8 +274,9 @@ def integrate(
 
     def frame(t: Any, y: RolloutState, args: Problem) -> Any:
         y = y.as_given()
-        value = y.particles if args.observe is None else args.observe(args.scene, args.at(y.particles))
-        return value, y.collider_impulse, y.boundary_impulse, y.memory
+        if args.observe is None:
+            return y, None
+        return replace(y, particles=cast(Any, None)), args.observe(args.scene, args.at(y.particles))
 
     subs = {"final": diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: y.as_given())}
     if save_every is not None:
@@ -297,10 +297,9 @@ def integrate(
     )
     times, values, (statistics, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
-    steps, saved = jnp.zeros((0,), dtype), (None,) * 4
-    if save_every is not None:
-        steps, saved = start + jnp.round(times["frames"]), values["frames"]
-    return End(steps, saved, final, start + statistics.steps.astype(dtype), statistics, report)
+    frames, observed = (None, None) if save_every is None else values["frames"]
+    steps = jnp.zeros((0,), dtype) if save_every is None else start + jnp.round(times["frames"])
+    return End(steps, frames, observed, final, start + statistics.steps.astype(dtype), statistics, report)
 
 
 def _before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
@@ -319,21 +318,3 @@ def segment(
     go = partial(integrate, replace(problem, start=first), begin, number, max_steps=max_steps)
     end = go(until=np.asarray(np.inf, first.dtype))
     return end.state, end.statistics, partial(_before_fault, go, begin, end.statistics)
-
-
-def run_to(problem: Problem, state: RolloutState, step: Any, statistics: RunStatistics, **saved: Any) -> Run:
-    """The run that ended in this state at step `step`; `saved` are its fields that hold more than its end."""
-    dtype = problem.particles.x.dtype
-    saved = {"steps": jax.device_put(np.zeros((0,), dtype)), "frames": None, "observed": None} | saved
-    return Run(
-        scene=problem.scene,
-        method=problem.method,
-        dt=problem.dt,
-        final=problem.at(state.particles),
-        final_step=jnp.asarray(step, dtype),
-        statistics=statistics,
-        final_collider_impulse=state.collider_impulse,
-        final_boundary_impulse=state.boundary_impulse,
-        final_memory=state.memory,
-        **saved,
-    )
