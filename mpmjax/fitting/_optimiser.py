@@ -138,15 +138,16 @@ def _to_a_bound(seen: Evaluation, damped: np.ndarray) -> np.ndarray | None:
     r, J, step, _ = _gauss_newton(seen)
     if not np.isfinite(step).all():
         return None
+    left, freedom = ((r + J @ step) ** 2).sum(), len(r) - len(step)
+    limit = _HIDDEN**2 * left / max(freedom, 1)  # of Δχ², by which chance puts a minimum beyond a bound
+    if freedom <= 0 or (r**2).sum() - left > limit * len(step):
+        return None  # Σ r² is no noise yet, and says nothing of errors
     (down, up), square = np.asarray(seen.room, float), np.maximum((J**2).sum(axis=0), np.finfo(float).tiny)
-    left, now = ((r + J @ step) ** 2).sum(), (r**2).sum()
-    near = square * np.minimum(down, up) ** 2 <= _HIDDEN**2 * left / max(len(r) - len(step), 1)
-    near &= left > now / 2  # else Σ r² is no noise yet, and says nothing of errors
+    near = square * np.minimum(down, up) ** 2 <= limit
     side = np.where(down < up, 1, -1)
-    straight = side * np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1))
+    straight = side * np.minimum(np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1)), _LEAP)
     wanted = np.where(near, straight, step)
-    held, far = near & (np.abs(damped) < np.abs(wanted) / 2), ~near & _bounded(seen) & (np.abs(step) > _FURTHEST)
-    return wanted if held.any() and not far.any() else None
+    return wanted if (near & (np.abs(damped) < np.abs(wanted) / 2)).any() else None
 
 
 def _bounded(seen: Evaluation) -> np.ndarray:
