@@ -63,7 +63,7 @@ def test_a_control_acts_as_in_a_loop_over_steps_written_out(whole):
     step = eqx.filter_jit(lambda scene, q, t: mpm.step(scene, q, t, DT)[0])
     for n in range(12):
         seen, particles, memory = of["control"](scene, particles, n * DT, DT, memory)
-        particles = step(seen, particles, n * DT)
+        particles = step(seen, particles, jnp.asarray(n * DT))
     assert_close(whole.final.x, particles.x)
     assert_close(whole.final.F, particles.F)
     assert_close(whole.final.history.activation, particles.history.activation)

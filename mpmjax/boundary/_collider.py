@@ -19,13 +19,16 @@ from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, S
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import ColliderConditions, Conditions, Slide, no_conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
+from mpmjax.boundary._flow_contact import FlowContact
+from mpmjax.boundary._plane_contact import SHUT, FlatWall
 from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import between, canonical, require, require_fields
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, length, still
+from mpmjax.potential import surface_image
 
 _ASKEW = 1e-6  # the slope to an axis up to which a half-space is across it: a turned one is so to rounding
+FAR = 0.1  # how far behind a surface what flows is pushed though nodes hold it, in spacings
 _LOOKS = 4  # places of a particle's way in which a collider is looked for
 
 
@@ -109,19 +112,6 @@ class AbstractCollider(AbstractBoundary):
         )
         return conditions, place, motion.velocity_of(place, t, dt)
 
-    def across_axes(self, t: Scalar) -> tuple[FlatWall, ...]:
-        """The planes of a half-space at time t, one across each axis, infinitely far where the normal is not along it;
-        none of other bodies."""
-        if not isinstance(self.shape, HalfSpace):
-            return ()
-        point, normal = jnp.asarray(self.shape.point), jnp.asarray(self.shape.normal)
-        if self.motion is not None:
-            point, normal = self.motion.place(point[None], t)[0], self.motion.turned(normal[None], t)[0]
-        size = jnp.abs(normal)
-        inward, along = jnp.where(normal < 0, -1, 1), size.sum() - size <= _ASKEW * size
-        places = jnp.where(along, point, jnp.where(normal < 0, jnp.inf, -jnp.inf))
-        return tuple((axis, places[axis], inward[axis]) for axis in range(self.dim))
-
     def wall_velocity(self, nodes: NodeVector, t: Scalar, dt: Scalar) -> NodeVector | None:
         return None if self.motion is None else self.motion.velocity_of(self.motion.origin(nodes, t), t, dt)
 
@@ -134,7 +124,17 @@ class AbstractHoldingCollider(AbstractCollider):
     meets_constraints: ClassVar[bool] = False
 
     def planes(self, t: Scalar) -> tuple[FlatWall, ...]:
-        return self.across_axes(t)
+        """The planes of a half-space at time t, one across each axis, infinitely far where the normal is not along it;
+        none of other bodies."""
+        if not isinstance(self.shape, HalfSpace):
+            return ()
+        point, normal = jnp.asarray(self.shape.point), jnp.asarray(self.shape.normal)
+        if self.motion is not None:
+            point, normal = self.motion.place(point[None], t)[0], self.motion.turned(normal[None], t)[0]
+        size = jnp.abs(normal)
+        inward, along = jnp.where(normal < 0, -1, 1), size.sum() - size <= _ASKEW * size
+        places = jnp.where(along, point, jnp.where(normal < 0, jnp.inf, -jnp.inf))
+        return tuple((axis, places[axis], inward[axis]) for axis in range(self.dim))
 
 
 class StickyCollider(AbstractHoldingCollider):
@@ -204,10 +204,12 @@ class SeparatingCollider(AbstractCollider):
 
     It has derivatives by its place and size, and those of its motion.
 
-    A fluid is held at a half-space across an axis as by a `SeparatingBox`, so that it stays at rest.
+    A fluid is held by nodes behind the surface that follow those before it (see `FlowContact`), so that it stays at
+    rest before any shape: its impact is without bounce.
 
-    *When it breaks*: as a `SeparatingBox`. Fluids do not come to rest at other shapes. A body or part of it that is
-    thinner than two spacings does not keep material out, and one that moves through more than a spacing in a step
+    *When it breaks*: as a `SeparatingBox`. At corners sharper than a right angle, and surfaces that bend within a few
+    spacings, a fluid's pressure is less exact. A body or part of it that is thinner than two spacings does not keep
+    material out, and one that moves through more than a spacing in a step
     leaves some behind. Not in the total description.
 
     Args:
@@ -241,24 +243,25 @@ class SeparatingCollider(AbstractCollider):
     def contacts(
         self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
     ) -> tuple[AbstractContact, ...]:
-        """Springs, and for what flows at a half-space a plane across each axis, as of a `SeparatingBox`."""
+        """Springs, and for what flows a map of the nodes around faces whose gap is shut."""
         assert faces is not None  # as it `pushes`
-        (surface,), planes = self.surfaces(faces.x, t, dt, faces.push_time), self.across_axes(t)
-        springs = surface_contact(surface, faces)
-        if not planes or not faces.flowing.any():
+        (surface,) = self.surfaces(faces.x, t, dt, faces.push_time)
+        springs, flowing = surface_contact(surface, faces), faces.flowing
+        if not flowing.any():
             return (springs,)
-        along = jnp.isfinite(jnp.stack([position for _, position, _ in planes]))
-        gap = springs.gap  # at the start, of a wall that moves too
+        gap = springs.gap  # at the start, of a body that moves too
         if self.motion is not None:
             gap = surface_contact(self.surfaces(faces.x, t, dt, t)[0], faces).gap
-        shut = faces.flowing & (gap <= SHUT * faces.spacing)
-        around = scatter(faces.stencil, (along[:, None] & shut).astype(faces.x.dtype), None, grid.size)
-        walls = wall_images(planes, faces, grid, window, velocity=self.wall_velocity(grid.nodes(window), t, dt))
-        each = enumerate(zip(walls, planes, strict=True))
-        held = [plane_contact((wall,), (plane[2],), self.friction, around[:, k : k + 1]) for k, (wall, plane) in each]
-        # an explicit step's springs push no face before the surface
-        beside = ~(along.any() & (faces.flowing[None] if faces.explicit else shut))
-        return (replace(springs, beside=beside), *held)
+        shut = flowing & (gap[0] <= SHUT * faces.spacing)
+        around = scatter(faces.stencil, jnp.stack([flowing, shut]).astype(faces.x.dtype), None, grid.size).T > 0
+        (at,), order = self.surfaces(grid.nodes(window), t, dt, t), len(faces.stencil.basis.knots) - 1
+        velocity = self.wall_velocity(grid.nodes(window), t, dt)
+        image = surface_image(at.distance, at.normal.T, around[0], grid, window, order, velocity)
+        places = image.spread(around[1].astype(faces.x.dtype)[:, None])[:, 0] > 0
+        # an explicit step's springs push no face before the surface; of what is held only what went through it
+        pushed = ~flowing if faces.explicit else ~shut
+        beside = pushed | (surface.distance < -FAR * faces.spacing)
+        return replace(springs, beside=beside[None]), FlowContact(image, self.friction, places)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         del grid

@@ -32,7 +32,16 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._conditions import PARALLEL, Conditions, OwnedImpulse
-from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Mirror, WallImage, scattered, with_one_mass
+from mpmjax.potential import (
+    AbstractSpring,
+    AbstractTerm,
+    AbstractWallImage,
+    Displacement,
+    Mirror,
+    WallImage,
+    scattered,
+    with_one_mass,
+)
 
 ActiveSet = tuple[Bool[Array, "..."], ...]  # the places that are held, one mask for each contact
 
@@ -110,7 +119,7 @@ class AbstractContact(eqx.Module):
         Default: it may not be."""
         return False
 
-    def images(self, active: Array) -> tuple[WallImage, ...]:
+    def images(self, active: Array) -> tuple[AbstractWallImage, ...]:
         """The mirrors that stand in the places held. Default: none."""
         return ()
 
@@ -176,6 +185,11 @@ class AbstractContact(eqx.Module):
         """The components of velocity on which the held places act, shape (n, d). Default: those of `fixed`."""
         return self.fixed(active, shape)
 
+    def takes(self, active: Array, shape: tuple[int, ...]) -> Mask:
+        """The components of velocity whose impulse, after walls and planes have theirs, is its own, shape (n, d).
+        Default: those of `fixed`."""
+        return self.fixed(active, shape)
+
     def representative(self) -> Bool[Array, "n"] | None:
         """One node of each place, shape (n,), by which places are counted; None where each node is a place."""
         return None
@@ -235,11 +249,13 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
 
     unconstrained: N  # the nodes of which no contact holds anything
     active: ActiveSet  # the active set
-    images: Mirror  # the mirrors in the columns that are held, by contacts or at all times
+    images: Mirror  # a scaling and the walls that hold nodes, in contact or at all times
     nodes: N  # the nodes with the active set held
     displacement: NodeVector | None = None
     """The displacement at which forces that are linear in it have their mean over the step [m], shape (n, d), mirrored
     as velocities are; None for none, as in an explicit step."""
+    held_by: tuple[int | None, ...] = eqx.field(static=True, default=())
+    """The number of the boundary of each wall among the images."""
 
     @property
     def mass(self) -> NodeScalar:
@@ -254,7 +270,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     def beyond_boundaries(self) -> tuple[Mask, tuple[NodeVector, ...]]:
         """The components of velocity on which no boundary acts, shape (n, d), and the normals that colliders hold."""
         free = self.unconstrained.free
-        reached = [image.reached(free.shape) for image in self.images.images if isinstance(image, WallImage)]
+        reached = [image.reached(free.shape) for image in self.images.images if isinstance(image, AbstractWallImage)]
         reached += [c.reached(a, free.shape) for c, a in zip(self.unconstrained.contacts, self.active, strict=True)]
         free = reduce(lambda free, held: free & ~held, reached, free)
         return free, tuple(jnp.where(free, normal, 0) for normal in self.nodes.projection.normals)
@@ -329,7 +345,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             by_order.append(by_contact)
         total = [reduce(jnp.add, each) / len(orders) for each in zip(*by_order, strict=True)]
         # v has been unfolded: its changes follow the walls, and are not scaled again
-        walls = Mirror(tuple(image for image in self.images.images if isinstance(image, WallImage)))
+        walls = Mirror(tuple(image for image in self.images.images if isinstance(image, AbstractWallImage)))
         changes = tuple(map(walls.unfold, total))
         return sum(changes, v), changes
 
@@ -338,12 +354,16 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     """The nodes with an active set held; no contact may hold anything of them yet."""
     pairs = list(zip(nodes.contacts, active, strict=True))
     # those that hold every column come last: they fill in what lies behind them in columns that contacts release
-    walls = sum((*(contact.images(mask) for contact, mask in pairs), *nodes.walls), ())
+    brought = [(number, contact.images(mask)) for number, (contact, mask) in zip(nodes.brought_by, pairs, strict=True)]
+    each = [(number, wall) for number, walls in (*brought, *enumerate(nodes.walls)) for wall in walls]
+    walls = tuple(wall for _, wall in each)
     fixed = nodes.conditions.fixed
-    images, mass = with_one_mass(walls, nodes.mass, fixed.shape[1]) if walls else (Mirror(()), nodes.mass)
+    images, order, mass = with_one_mass(walls, nodes.mass, fixed) if walls else (Mirror(()), (), nodes.mass)
     fixed = reduce(jnp.logical_or, (contact.fixed(mask, fixed.shape) for contact, mask in pairs), fixed)
     springs = tuple(term for contact, mask in pairs if (term := contact.springs(mask)) is not None)
-    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, mass, fixed, springs))
+    held_by = tuple(each[k][0] for k in order)
+    constrained = nodes.constrained(images, mass, fixed, springs)
+    return ConstrainedNodes(nodes, active, images, constrained, held_by=held_by)
 
 
 def count_places(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:

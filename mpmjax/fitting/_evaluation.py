@@ -150,9 +150,11 @@ def residuals_at(
     problem: FitProblem, points: Float[Array, "b n"], sigmas: Sigmas, kept: tuple[Kept, ...] | None
 ) -> Float[Array, "b m"]:
     """Residuals at some points together, without derivatives; `kept` as of `parts_kept`."""
-    if kept is None:
-        return _residuals_at_once(problem, points, sigmas)
-    return jax.vmap(lambda z: staged(problem, z, sigmas, kept)[0][0])(points)
+
+    def one(z: Coordinates) -> Array:
+        return (_residuals(problem, z, sigmas) if kept is None else staged(problem, z, sigmas, kept)[0])[0]
+
+    return jax.vmap(one)(points)
 
 
 def costs_at(
@@ -173,7 +175,4 @@ def costs_at(
     return costs
 
 
-@eqx.filter_jit
-def _residuals_at_once(problem: FitProblem, points: Float[Array, "b n"], sigmas: Sigmas) -> Float[Array, "b m"]:
-    """The residuals at some points together, in one program, which keeps no states."""
-    return jax.vmap(lambda z: problem.residuals(z, sigmas, diffrax.ForwardMode())[0])(points)
+_residuals = eqx.filter_jit(lambda problem, z, sigmas: problem.residuals(z, sigmas, diffrax.ForwardMode()))

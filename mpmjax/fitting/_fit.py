@@ -66,33 +66,28 @@ def fit(
         })
         print(result)
 
-    The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched, with
-    derivatives through every step and every implicit solve. A step at which a simulation fails is not taken. A σ that
-    is not given is estimated: as √(Σ r²/(m − n)), of several observations in rounds, each by its own misfit.
-
-    Where the misfit is beyond the noise, or residuals have a shape, other starts are tried (`starts`), and errors and
-    intervals hold it, those of the noise alone beside them (docs/fitting.md#intervals-that-hold). None of it sees what
-    a parameter can make up for: for that see `discretisation`.
-
-    Ctrl-C ends a fit after the iteration in progress, and it returns the best that it has, not converged.
+    The least sum of squares of (simulated − measured)/σ over all observations is searched, with derivatives through
+    every step and every implicit solve. A σ that is not given is estimated as √(Σ r²/(m − n)), of several observations
+    in rounds. Errors and intervals hold a misfit beyond the noise, those of the noise alone beside them
+    (docs/fitting.md#intervals-that-hold). Ctrl-C ends a fit after the iteration in progress: the best so far is
+    returned, not converged.
 
     Args:
         experiments: one or several, which share the parameters.
         parameters: what is fitted, by name.
         starts: from how many points it is searched, or which (`Starts`). "auto": where the misfit of the first search
-            is beyond the noise, 24 more points are looked at, a simulation each, and some searched from, until a misfit
-            is within it; `result.screening` has what they found. 1 searches from the first guess alone.
+            is beyond the noise, 24 more points are looked at, and some searched from, until a misfit is within it;
+            `result.screening` has what they found. 1 searches from the first guess alone.
         discretisation: whether to look at twice the spacing, and at twice the step there, by three runs each at most,
-            and count as errors how far the minimum moves, as the grid convergence index does. Without it nobody knows:
-            what parameters make up for leaves no misfit.
+            and count as errors how far the minimum moves. What parameters make up for leaves no misfit that tells.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
         optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, with few
             parameters or few measured numbers, else `LBFGS`.
         memory: for what reverse mode stores, and for the tangents of forward mode that are made at once [B].
         progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`.
-        log: an HDF5 file that is to hold each iteration (docs/fitting.md), and lacks at most the one in progress,
-            whatever ends the fit. It holds the first search, and the last one from another start.
+        log: an HDF5 file that holds each iteration (docs/fitting.md) but the one in progress, whatever ends the fit: of
+            the first search, and of the last one from another start.
         resume: continue the fit of the log, bit for bit. Only the optimiser's `max_steps` may differ.
 
     Raises:

@@ -29,11 +29,10 @@ class LevenbergMarquardt(AbstractOptimiser):
     Near a bound the coordinate hides the value from it: the damping then holds a step that the data ask for. There the
     next one is the Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds.
 
-    It ends where a step changes no coordinate and no residual by more than the tolerance, or where the next
-    Gauss-Newton step, no longer than to a bound, would be less than a ten-thousandth of the standard error that the
-    misfit gives, or where a step is refused and could lower the sum of squares by no more than its rounding, as in
-    single precision. Where only steps far shorter than the Gauss-Newton step are taken, since the simulation fails
-    beyond or the misfit has a kink, it has not converged.
+    It ends where a step changes nothing by more than the tolerance, where the next Gauss-Newton step, no longer than to
+    a bound, is less than a ten-thousandth of the standard error that the misfit gives, or where one is refused and
+    could lower Σ r² by no more than its rounding. Where only steps far shorter than the Gauss-Newton step are taken,
+    since the simulation fails beyond or the misfit has a kink, it has not converged.
 
     Args:
         rtol: relative and absolute tolerance of coordinates and residuals.
@@ -139,15 +138,16 @@ def _to_a_bound(seen: Evaluation, damped: np.ndarray) -> np.ndarray | None:
     r, J, step, _ = _gauss_newton(seen)
     if not np.isfinite(step).all():
         return None
+    left, freedom = ((r + J @ step) ** 2).sum(), len(r) - len(step)
+    limit = _HIDDEN**2 * left / max(freedom, 1)  # of Δχ², by which chance puts a minimum beyond a bound
+    if freedom <= 0 or (r**2).sum() - left > limit * len(step):
+        return None  # Σ r² is no noise yet, and says nothing of errors
     (down, up), square = np.asarray(seen.room, float), np.maximum((J**2).sum(axis=0), np.finfo(float).tiny)
-    left, now = ((r + J @ step) ** 2).sum(), (r**2).sum()
-    near = square * np.minimum(down, up) ** 2 <= _HIDDEN**2 * left / max(len(r) - len(step), 1)
-    near &= left > now / 2  # else Σ r² is no noise yet, and says nothing of errors
+    near = square * np.minimum(down, up) ** 2 <= limit
     side = np.where(down < up, 1, -1)
-    straight = side * np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1))
+    straight = side * np.minimum(np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1)), _LEAP)
     wanted = np.where(near, straight, step)
-    held, far = near & (np.abs(damped) < np.abs(wanted) / 2), ~near & _bounded(seen) & (np.abs(step) > _FURTHEST)
-    return wanted if held.any() and not far.any() else None
+    return wanted if (near & (np.abs(damped) < np.abs(wanted) / 2)).any() else None
 
 
 def _bounded(seen: Evaluation) -> np.ndarray:
@@ -176,10 +176,10 @@ def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray,
 class LBFGS(AbstractOptimiser):
     """The limited-memory BFGS method of optax with its zoom line search, on gradients by reverse mode.
 
-    An iteration is a line search: mostly one simulation with its gradient, whose cost does not grow with the number of
-    parameters. The first step is of length one at most. A step at which a simulation or its derivative fails counts as
-    infinitely bad. A line search that finds nothing lower is begun again along the negative gradient; where that finds
-    nothing either, the search ends, and has not converged.
+    An iteration is a line search: mostly one simulation with its gradient, whatever the number of parameters. The first
+    step is of length one at most. Where a simulation or its derivative fails the cost is infinite. A line search that
+    finds nothing lower is begun again along the negative gradient; where that finds nothing either, the search ends,
+    and has not converged.
 
     It ends where two line searches in a row bring the cost, ½ Σ r², less than `rtol`² σ² lower, foreseen and done,
     σ² = Σ r²/(m − n): some `rtol` standard errors from the minimum. Or where rounding hides what they bring.
@@ -292,9 +292,8 @@ def evaluated_once(evaluate: Callable[[Coordinates], tuple[Array, Array]]) -> Ca
 class Adam(AbstractOptimiser):
     """The Adam method of optax on gradients by reverse mode: for costs that are rough, where a line search is caught.
 
-    An iteration is one simulation with its gradient. The search keeps the best place that it has seen. Where a
-    simulation or its derivative fails, or `patience` iterations in a row find nothing lower, it goes back there and
-    begins anew, its steps half as long. It ends where these are shorter than `atol` coordinates.
+    An iteration is one simulation with its gradient. Where that fails, or `patience` iterations in a row find nothing
+    lower, it begins anew at the best place, its steps half as long, and ends where these are shorter than `atol`.
 
     Args:
         learning_rate: length of a step in each coordinate [-], 0.05 for five per cent of a `Positive` parameter, or a

@@ -10,6 +10,7 @@ from mpmjax.potential._mirror import (
     mirror_image as mirror_image,
     with_one_mass as with_one_mass,
 )
+from mpmjax.potential._surface_image import SurfaceImage as SurfaceImage, surface_image as surface_image
 from mpmjax.potential._term import (
     AbstractSpring as AbstractSpring,
     AbstractStiffness as AbstractStiffness,
@@ -18,4 +19,8 @@ from mpmjax.potential._term import (
     Forces as Forces,
     scattered as scattered,
 )
-from mpmjax.potential._wall_image import WallImage as WallImage, wall_image as wall_image
+from mpmjax.potential._wall_image import (
+    AbstractWallImage as AbstractWallImage,
+    WallImage as WallImage,
+    wall_image as wall_image,
+)

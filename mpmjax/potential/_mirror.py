@@ -23,7 +23,8 @@ from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import require
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractMotion
-from mpmjax.potential._wall_image import WallImage
+from mpmjax.potential._surface_image import SurfaceImage, one_mass
+from mpmjax.potential._wall_image import AbstractWallImage, WallImage
 
 
 class MirrorPlace(NamedTuple):
@@ -146,28 +147,48 @@ class Image(AbstractImage):
 
 
 class Scaling(AbstractImage):
-    """A factor of each component of velocity, by which nodes that walls tie to others have one mass for all of them."""
+    """A factor of each component of velocity, or a matrix, by which nodes that walls tie to others have one mass for
+    all of them."""
 
-    factor: NodeVector  # shape (n, d) [-]
+    factor: Float[Array, "n d *d"]  # shape (n, d), or (n, d, d) [-]
+    inverse: Float[Array, "n d *d"]  # its inverse, in the same shape [-]
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
         return field
 
     def vector(self, field: NodeVector) -> NodeVector:
-        return self.factor * field
+        return multiplied(self.factor, field)
 
 
-def with_one_mass(walls: tuple[WallImage, ...], mass: NodeScalar, dim: int) -> tuple["Mirror", NodeScalar]:
-    """The maps of walls, one or more, that hold nodes of these masses [kg], shape (n,), with a scaling before them, and
-    the masses folded by them: a node b has the mass Σ m along the wall, and across it Σ B² m by a unit of its velocity;
-    it is scaled so that both are one."""
+def multiplied(factor: Float[Array, "n d *d"], field: NodeVector) -> NodeVector:
+    """Each node's vector times factors of its components, or a matrix."""
+    return factor * field if factor.ndim == 2 else (factor * field[:, None]).sum(axis=2)
+
+
+def with_one_mass(
+    walls: tuple[AbstractWallImage, ...], mass: NodeScalar, fixed: Mask
+) -> tuple["Mirror", tuple[int, ...], NodeScalar]:
+    """The maps of walls, one or more, that hold nodes of these masses [kg], shape (n,), with a scaling before them; the
+    numbers of the walls in the maps' order; and the masses folded by them. A node b before a wall across an axis has
+    the mass Σ m along it, and across it Σ B² m by a unit of its velocity; it is scaled so that both are one. Surfaces
+    come first, and follow no nodes that later maps fill in."""
+    planes = [(k, wall) for k, wall in enumerate(walls) if isinstance(wall, WallImage)]
+    surfaces = [(k, wall) for k, wall in enumerate(walls) if isinstance(wall, SurfaceImage)]
+    numbers, dim, usable = tuple(k for k, _ in (*surfaces, *planes)), fixed.shape[1], mass > 0
     masses = jnp.broadcast_to(mass[:, None], (len(mass), dim + 1))
-    for wall in reversed(walls):
-        masses = wall.fold_masses(masses)
-    across, along = masses[:, :dim], masses[:, dim:]
-    both = (across > 0) & (along > 0)
-    factor = jnp.sqrt(jnp.where(both, along, 1) / jnp.where(both, across, 1))
-    return Mirror((Scaling(factor), *walls)), masses[:, dim]
+    for _, wall in reversed(planes):
+        masses, usable = wall.fold_masses(masses), usable & ~wall.carried(dim).any(axis=1)
+    images, across, mass = tuple(wall for _, wall in planes), masses[:, :dim], masses[:, dim]
+    if not surfaces:
+        both = (across > 0) & (masses[:, dim:] > 0)
+        factor = jnp.sqrt(jnp.where(both, masses[:, dim:], 1) / jnp.where(both, across, 1))
+        return Mirror((Scaling(factor, 1 / factor), *images)), numbers, mass
+    across = across[:, :, None] * jnp.eye(dim, dtype=mass.dtype)
+    for _, surface in reversed(surfaces):
+        image = surface.taking(usable)
+        across, mass, usable = image.fold_masses(across), image.fold_scalar(mass), usable & ~image.follows
+        images = (image, *images)
+    return Mirror((Scaling(*one_mass(across, mass, fixed)), *images)), numbers, mass
 
 
 def transposed(linear: Callable[[Array], Array], field: Array) -> Array:
@@ -190,14 +211,14 @@ class Tie(AbstractImage):
 class Mirror(eqx.Module):
     """The mirrors of several planes: `unfold` applies B, from true nodes to all nodes; `fold` applies Bᵀ."""
 
-    images: tuple[AbstractImage | WallImage, ...]  # the images at each plane, in their order
+    images: tuple[AbstractImage | AbstractWallImage, ...]  # the images at each plane, in their order
 
     def unfold(self, field: NodeVector) -> NodeVector:
         """B v: fill in the mirror images."""
         unfolded = field
         for image in self.images:
             unfolded = image.vector(unfolded)
-            unfolded = image.moved(unfolded, field) if isinstance(image, WallImage) else unfolded
+            unfolded = image.moved(unfolded, field) if isinstance(image, AbstractWallImage) else unfolded
         return unfolded
 
     def fold(self, field: NodeVector) -> NodeVector:
@@ -207,13 +228,13 @@ class Mirror(eqx.Module):
     def unscaled(self, field: NodeVector) -> NodeVector:
         """A velocity of true nodes, as that of which `unfold` makes it by its scaling."""
         for image in self.images:
-            field = field / image.factor if isinstance(image, Scaling) else field
+            field = multiplied(image.inverse, field) if isinstance(image, Scaling) else field
         return field
 
     @property
-    def moving(self) -> tuple[Image | WallImage, ...]:
+    def moving(self) -> tuple[Image | AbstractWallImage, ...]:
         """The mirrors and walls that move."""
-        planes = (image for image in self.images if isinstance(image, Image | WallImage))
+        planes = (image for image in self.images if isinstance(image, Image | AbstractWallImage))
         return tuple(image for image in planes if image.velocity is not None)
 
     def added(self, field: NodeVector) -> NodeVector:
@@ -227,7 +248,7 @@ class Mirror(eqx.Module):
         """A velocity [m/s], shape (n, d), with 2V in its odd components beyond mirrors that move, and (1 − B) V behind
         walls that do. Where several mirrors reach, the first one holds, of walls the last."""
         images = self.moving
-        walls = [image for image in images if isinstance(image, WallImage)]
+        walls = [image for image in images if isinstance(image, AbstractWallImage)]
         for image in (*reversed([image for image in images if isinstance(image, Image)]), *walls):
             velocity = image.with_motion(velocity)
         return velocity

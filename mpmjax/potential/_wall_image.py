@@ -1,5 +1,7 @@
 """Walls that lie anywhere across an axis: the map of the nodes about them, linear across the wall."""
 
+import abc
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,46 @@ from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector,
 from mpmjax.discretisation import Grid, Stencil
 
 
-class WallImage(eqx.Module):
+class AbstractWallImage(eqx.Module):
+    """The map of the nodes about a wall or surface that holds them."""
+
+    velocity: eqx.AbstractVar[NodeVector | None]  # of one that moves, at the nodes [m/s], shape (n, d); None at rest
+
+    @abc.abstractmethod
+    def scalar(self, field: Array) -> Array:
+        """B for an even scalar field."""
+
+    @abc.abstractmethod
+    def fold_scalar(self, field: Array) -> Array:
+        """Bᵀ for an even scalar field."""
+
+    @abc.abstractmethod
+    def vector(self, field: NodeVector) -> NodeVector:
+        """B for a vector field."""
+
+    @abc.abstractmethod
+    def fold(self, field: NodeVector) -> NodeVector:
+        """Bᵀ for a vector field."""
+
+    @abc.abstractmethod
+    def moved(self, unfolded: NodeVector, field: NodeVector) -> NodeVector:
+        """A field that `vector` has unfolded, with what the wall's motion adds to it as the `field` before has it."""
+
+    @abc.abstractmethod
+    def reached(self, shape: tuple[int, ...]) -> Mask:
+        """All components of velocity on which it acts, a mask of this shape (n, d)."""
+
+    @abc.abstractmethod
+    def carried(self, dim: int) -> Mask:
+        """The components that follow others by B, shape (n, d). Of a wall that moves a field has there what its motion
+        adds."""
+
+    @abc.abstractmethod
+    def with_motion(self, field: NodeVector) -> NodeVector:
+        """A velocity [m/s] with (1 − B) V in these components."""
+
+
+class WallImage(AbstractWallImage):
     """The map of a wall that lies anywhere across an axis (see `wall_image`), in the columns of nodes that it holds.
 
     It touches the K *rows* of nodes from b to a spacing and a kernel behind the wall: a slice of the grid. Blocks are
@@ -60,19 +101,15 @@ class WallImage(eqx.Module):
         return self.column(self.rows(weights)) > 0
 
     def reached(self, shape: tuple[int, ...]) -> Mask:
-        """All components of velocity of b and of what follows it, a mask of this shape (n, d)."""
         mask = (self.base | self.follows) & (True if self.held is None else self.held)
         nodes = jnp.zeros((self.layers, *self.shape, 1), bool)
         return jnp.broadcast_to(self.with_rows(nodes, self.rows(nodes) | mask).reshape(-1, 1), shape)
 
     def carried(self, dim: int) -> Mask:
-        """The components that follow b by B, shape (n, d). Of a wall that moves a field has there what its motion
-        adds."""
         follows, rows = self._moved(dim), self.rows(jnp.zeros((self.layers, *self.shape, dim), bool))
         return self.with_rows(jnp.zeros((self.layers, *self.shape, dim), bool), rows | follows).reshape(-1, dim)
 
     def with_motion(self, field: NodeVector) -> NodeVector:
-        """A velocity [m/s] with (1 − B) V in these components."""
         assert self.velocity is not None
         added = (1 - self.share) * self.rows(self.velocity)
         return self.with_rows(field, jnp.where(self._moved(field.shape[1]), added, self.rows(field)))
@@ -82,11 +119,9 @@ class WallImage(eqx.Module):
         return follows & ((jnp.arange(dim) == self.axis) | self.sticks)
 
     def scalar(self, field: Array) -> Array:
-        """B for an even scalar field."""
         return self._copied(field, self.tied, 1)
 
     def fold_scalar(self, field: Array) -> Array:
-        """Bᵀ for an even scalar field."""
         return self._gathered(field, self.tied, 1)
 
     def united(self, blocks: Array, *, whole: bool = False) -> Array:
@@ -96,18 +131,15 @@ class WallImage(eqx.Module):
         return self.with_rows(blocks, jnp.where(alike, self.column(jnp.where(alike, rows, 0)), rows))
 
     def vector(self, field: NodeVector) -> NodeVector:
-        """B for a vector field."""
         return self._copied(field, *self._components(jnp.arange(field.shape[1]) == self.axis, self.share))
 
     def moved(self, unfolded: NodeVector, field: NodeVector) -> NodeVector:
-        """A field that `vector` has unfolded, with what the wall's motion adds to it as the `field` before has it."""
         if self.velocity is None:
             return unfolded
         added = jnp.where(self._moved(field.shape[1]), self.rows(field), 0)
         return self.with_rows(unfolded, self.rows(unfolded) + added)
 
     def fold(self, field: NodeVector) -> NodeVector:
-        """Bᵀ for a vector field."""
         return self._gathered(field, *self._components(jnp.arange(field.shape[1]) == self.axis, self.share))
 
     def fold_masses(self, masses: Float[Array, "n c"]) -> Float[Array, "n c"]:

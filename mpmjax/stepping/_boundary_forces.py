@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, NodeVector, Scalar
+from mpmjax._types import Array, Mask, NodeVector, Scalar
 from mpmjax.boundary import (
     ConstrainedNodes,
     Impulses,
@@ -15,7 +15,7 @@ from mpmjax.boundary import (
     taken_by_mirrors,
 )
 from mpmjax.discretisation import Gathered
-from mpmjax.potential import Image, Mirror, WallImage
+from mpmjax.potential import AbstractImage, AbstractWallImage, Image, Mirror
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping._grid_update import GridUpdate, reaction
 from mpmjax.stepping._integrator import AbstractIntegrator
@@ -39,6 +39,9 @@ def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator,
         if isinstance(part.owner, int) and part.owner in numbers:
             parts.append(replace(part, owner=numbers.index(part.owner)))
     parts.append(OwnedImpulse(holding, colliders.holder))
+    for number, mine in _taken_by_contacts(held, colliders.holder >= 0):
+        if number in numbers:
+            parts.append(OwnedImpulse(jnp.where(mine, holding, 0), numbers.index(number)))
     mass, tied = (nodes if nodes.loose is None else nodes.loose).mass[:, None], Mirror(nodes.tied)
     for number, contact, active, change in zip(
         nodes.brought_by, nodes.contacts, held.active, new.friction, strict=True
@@ -111,11 +114,8 @@ def impulse_on_boundaries(
     of_planes, residual = taken_by_mirrors(residual, _walls_of(held))
     parts += [*of_planes, OwnedImpulse(residual, owners)]
     taken = owners >= 0
-    for number, contact, active in contacts:
-        if number is not None:
-            mine = contact.fixed(active, residual.shape) & ~taken
-            parts.append(OwnedImpulse(jnp.where(mine, residual, 0), number))
-            taken = taken | mine
+    for number, mine in _taken_by_contacts(held, taken):
+        parts.append(OwnedImpulse(jnp.where(mine, residual, 0), number))
 
     for (number, _, _), change in zip(contacts, new.friction, strict=True):
         of_planes, friction = taken_by_mirrors(unfolded.mass[:, None] * unfold(change), images)
@@ -140,13 +140,22 @@ def impulse_on_boundaries(
     return received_impulses(parts, places, pivots, couples)
 
 
-def _walls_of(held: ConstrainedNodes[Nodes]) -> list[tuple[int, WallImage]]:
-    """The walls across axes that hold columns, of contacts and those that are never left, with the numbers of their
-    boundaries."""
-    nodes = held.unconstrained
-    contacts = zip(nodes.brought_by, nodes.contacts, held.active, strict=True)
-    brought = [(number, contact.images(active)) for number, contact, active in contacts if number is not None]
-    return [(number, wall) for number, walls in (*brought, *enumerate(nodes.walls)) for wall in walls]
+def _walls_of(held: ConstrainedNodes[Nodes]) -> list[tuple[int, AbstractImage | AbstractWallImage]]:
+    """The walls that hold nodes, of contacts and those that are never left, with the numbers of their boundaries."""
+    each = zip(held.held_by, held.images.images[1:], strict=True)  # after the scaling
+    return [(number, wall) for number, wall in each if number is not None]
+
+
+def _taken_by_contacts(held: ConstrainedNodes[Nodes], taken: Mask) -> list[tuple[int, Mask]]:
+    """The components whose impulse is that of each contact, by its boundary's number: first what contacts fix."""
+    nodes, parts = held.unconstrained, []
+    contacts = [c for c in zip(nodes.brought_by, nodes.contacts, held.active, strict=True) if c[0] is not None]
+    for which in ("fixed", "takes"):
+        for number, contact, active in contacts:
+            mine = getattr(contact, which)(active, taken.shape) & ~taken
+            parts.append((number, mine))
+            taken = taken | mine
+    return parts
 
 
 def _boundaries_of_colliders(scene: Scene) -> list[int]:
