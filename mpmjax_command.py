@@ -1,7 +1,7 @@
-"""The shell's `mpmjax`: its options, and what is refused before the package is imported.
+"""The shell's `mpmjax`: its options, and what is refused before a room of the package is imported.
 
-It stands outside of the package, whose import takes a second: who asks for help or errs waits less, and meanwhile
-Ctrl-C ends the command as quietly as SIGTERM does, not with a traceback of what was being imported.
+It imports no room until it needs one, which takes a second: who asks for help or errs waits less, and meanwhile Ctrl-C
+ends the command as quietly as SIGTERM does, not with a traceback of what was being imported.
 """
 
 import importlib
@@ -83,8 +83,8 @@ def _require_folder(path: Path | None) -> None:
     _require(there, f"{path} cannot be written (no folder {path and path.parent}): name a place that can be.")
 
 
-def _reporting(command: Callable[..., None]) -> Callable[..., None]:
-    """Decorate a command to tell its errors in one line and exit with code 2."""
+def _command(command: Callable[..., None]) -> Callable[..., None]:
+    """Make a function a command, which tells its errors in one line and exits with code 2."""
 
     def tell(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
@@ -106,7 +106,7 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
             tell(f"mpmjax: {' '.join(str(error).split()) or 'there is not enough memory for this'}")
             raise typer.Exit(2) from None
 
-    return guarded
+    return app.command()(guarded)
 
 
 def scene_table(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
@@ -186,8 +186,7 @@ def _(
         raise typer.Exit
 
 
-@app.command()
-@_reporting
+@_command
 def run(
     scene: ScenePath,
     output: Annotated[
@@ -223,8 +222,8 @@ def run(
     free = overwrite or resume or not output.exists()
     _require(free, f"{output} exists: choose another name, or give --overwrite or --resume.")
     _require_folder(output)
-    options = {"dt": dt, "t1": t1, "method": method}
-    changed = [*(changes or ()), *(f"run.{key}={value}" for key, value in options.items() if value is not None)]
+    overrides = {"dt": dt, "t1": t1, "method": method}
+    changed = [*(changes or ()), *(f"run.{key}={value}" for key, value in overrides.items() if value is not None)]
     settings = scene_table(scene, changed)["run"]
     if steps is not None:
         step = settings.get("dt") if isinstance(settings, dict) else None
@@ -238,14 +237,12 @@ def run(
         with _package(imports) as cli:
             cli.study_scene(scene, output, changed, members, quiet=quiet)
         return
+    options = {"overwrite": overwrite, "resume": resume, "quiet": quiet, "most_seconds": most_seconds}
     with _package(imports) as cli:
-        cli.run_scene(
-            scene, output, changed, overwrite=overwrite, resume=resume, quiet=quiet, most_seconds=most_seconds
-        )
+        cli.run_scene(scene, output, changed, **options)
 
 
-@app.command()
-@_reporting
+@_command
 def check(
     scene: ScenePath,
     plot: Annotated[Path | None, typer.Option(help="A picture of the particles as they start, to write.")] = None,
@@ -259,8 +256,7 @@ def check(
         cli.check_scene(scene, changes or (), plot)
 
 
-@app.command()
-@_reporting
+@_command
 def fit(
     scene: ScenePath,
     plot: Annotated[Path | None, typer.Option(help="The picture to write. Default: SCENE_fit.png here.")] = None,
@@ -294,8 +290,7 @@ def fit(
         cli.fit_scene(scene, plot, grids, profiles or (), log=log, resume=resume, most_seconds=most_seconds)
 
 
-@app.command()
-@_reporting
+@_command
 def chart(
     scene: ScenePath,
     error: Annotated[float, typer.Option(help="The relative error of the motion that is asked for.")] = 1e-2,
@@ -322,8 +317,7 @@ def _angles(text: str) -> tuple[float, float]:
     return azimuth, elevation
 
 
-@app.command()
-@_reporting
+@_command
 def render(
     path: RunPath,
     output: Annotated[
@@ -357,8 +351,7 @@ def render(
     print(f"written {output}")
 
 
-@app.command()
-@_reporting
+@_command
 def info(
     path: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="An HDF5 file of a run, to describe.")] = None,
     table: Annotated[
@@ -376,8 +369,7 @@ def info(
         print(cli.installation() if path is None else cli.describe_run(path, table))
 
 
-@app.command()
-@_reporting
+@_command
 def schema(imports: Imports = None) -> None:
     """Print the JSON schema of scene files, for editors.
 
@@ -386,8 +378,7 @@ def schema(imports: Imports = None) -> None:
         print(json.dumps(cli.scene_schema(), indent=1))
 
 
-@app.command()
-@_reporting
+@_command
 def example(
     name: Annotated[str | None, typer.Argument(help="Such as jelly. Without it they are listed.")] = None,
 ) -> None:
@@ -414,7 +405,3 @@ def example(
         print(f"written {target}")
     commands = re.findall(r"^# +((?:mpmjax|python) .*)$", (folder / names[0]).read_text(encoding="utf-8"), re.MULTILINE)
     print("\n".join(commands or [f"python examples/{names[0]}"]))
-
-
-if __name__ == "__main__":  # `python -m mpmjax_command`, the command without its script
-    main()

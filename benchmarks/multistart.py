@@ -33,7 +33,7 @@ import numpy as np
 
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._search import begin, iterate_together
+from mpmjax.fitting._search import iterate_together
 from mpmjax.fitting._starts import linked, starting_points, unit_points
 
 NOISE = 1e-4
@@ -121,7 +121,7 @@ def iteration(pull: mpm.Experiment, points: np.ndarray, batch: int) -> Callable[
     problem, optimiser = FitProblem((pull,), PARAMETERS), mpm.fitting.LevenbergMarquardt()
     common = problem, problem.first_sigmas
     none = jax.tree.map(lambda _: None, common)
-    states = [begin(problem, optimiser, jnp.asarray(z), problem.first_sigmas) for z in points[:batch]]
+    states = [optimiser.begin(problem, jnp.asarray(z), problem.first_sigmas) for z in points[:batch]]
     arrays, rest = zip(*(eqx.partition(s, eqx.is_array) for s in states), strict=True)
     state = eqx.combine(jax.tree.map(lambda *a: np.stack(a), *arrays), rest[0])
     return lambda: eqx.filter(

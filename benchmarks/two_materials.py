@@ -115,7 +115,7 @@ def plane(cells: int, shift: float, *, ratio: float = 0.0, steps: int = 0, **cho
         final = mpm.simulate(scene, final, t1=steps * dt, dt=dt).final
     stress, V = np.asarray(mpm.stress(scene, final))[:, 1, 1], np.asarray(final.volume)
     exact = -DENSITY * GRAVITY * (2 - np.asarray(start.x)[:, 1])
-    groups = [slice(*group.rows) for group in final.groups]
+    groups = [group.rows for group in final.groups]
     means = [100 * ((stress * V)[g].sum() / (exact * V)[g].sum() - 1) for g in groups]
     beside = np.asarray(start.x)[groups[0], 1] < face + dx
     return means, float(np.abs(stress / exact - 1)[groups[0]][beside].max())
@@ -135,7 +135,7 @@ def beside(cells: int, **choices) -> tuple[float, ...]:
     run = mpm.simulate(scene, particles, t1=1e4, dt=5e3, method=mpm.BackwardEuler(), save_every=1)
     stress = np.asarray(mpm.stress(scene, run.final))[:, 1, 1]
     force = float(np.asarray(run.boundary_forces().force)[-1, 0, 1])
-    groups = [slice(*group.rows) for group in run.final.groups]
+    groups = [group.rows for group in run.final.groups]
     means = [stress[g].mean() / (-strain * E) for g, E in zip(groups, (SOFT, STIFF), strict=True)]
     return tuple(100 * (a - 1) for a in (force / (strain * (SOFT + STIFF)), *means))
 

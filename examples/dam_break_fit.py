@@ -53,7 +53,7 @@ parameters = {
 found = mpm.fitting.fit_refined(dam, parameters, optimiser=mpm.fitting.LevenbergMarquardt(rtol=1e-4), progress=print)
 print(found)
 finest = found.fits[-1]
-print(f"correlation of friction and release: {finest.correlation[0, 1]:.2f}")
+print(f"correlation of friction and release: {finest.uncertainty.correlation[0, 1]:.2f}")
 print(finest.noise[0])
 
 # %%

@@ -112,7 +112,7 @@ def predicted(result, parameters, curve):
     z = jnp.zeros(len(again))
     value, J = np.asarray(at(z)), np.asarray(jax.jacfwd(at)(z))
     reach = students_t.ppf((1 + result.level) / 2, result.degrees_of_freedom)
-    reach = reach * np.sqrt(np.einsum("mi,ij,mj->m", J, result.covariance, J))
+    reach = reach * np.sqrt(np.einsum("mi,ij,mj->m", J, result.uncertainty.covariance, J))
     return value, value - reach, value + reach
 
 

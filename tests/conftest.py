@@ -27,8 +27,10 @@ def pytest_configure(config: Any) -> None:
         return
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
+    jax.config.update("jax_traceback_in_locations_limit", 0)  # no lines of Python in programs: a thirtieth of the time
     with install_import_hook("mpmjax", "annotations.checked"):
-        import mpmjax  # noqa: F401
+        import mpmjax.extensions
+        import mpmjax.stepping  # noqa: F401
     # tracing makes many objects, few of them in cycles: looking for those took a twelfth of the time
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)

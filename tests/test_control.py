@@ -63,7 +63,7 @@ def test_a_control_acts_as_in_a_loop_over_steps_written_out(whole):
     step = eqx.filter_jit(lambda scene, q, t: mpm.step(scene, q, t, DT)[0])
     for n in range(12):
         seen, particles, memory = of["control"](scene, particles, n * DT, DT, memory)
-        particles = step(seen, particles, n * DT)
+        particles = step(seen, particles, jnp.asarray(n * DT))
     assert_close(whole.final.x, particles.x)
     assert_close(whole.final.F, particles.F)
     assert_close(whole.final.history.activation, particles.history.activation)
@@ -136,6 +136,8 @@ def test_a_run_goes_on_from_its_memory_and_its_file(whole, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, ended.final, whole.final)
     jax.tree.map(np.testing.assert_array_equal, ended.final_memory, whole.final_memory)
     mpm.save(tmp_path / "saved.vtkhdf", whole)
+    with pytest.raises(ValueError, match=r"control is 'unknown' .* go on by simulate"):
+        mpm.record(tmp_path / "saved.vtkhdf", scene, particles, t1=12 * DT, dt=DT, save_every=4, resume=True, **of)
     for name in ("run", "saved"):
         run = mpm.load(tmp_path / f"{name}.vtkhdf")
         jax.tree.map(np.testing.assert_array_equal, run.frames, whole.frames)
@@ -179,6 +181,9 @@ def test_controls_that_break_their_promise_are_refused():
     ):
         with pytest.raises(ValueError, match=told):
             mpm.simulate(scene, particles, t1=DT, dt=DT, control=control, memory=memory)
+    total, drain = block(2, description=mpm.TotalLagrangian())[0], Outlet(mpm.Box((0.0, 0.0), (0.1, 0.1)))
+    with pytest.raises(ValueError, match="in the updated description only: drop TotalLagrangian"):
+        mpm.simulate(total, block(2)[1], t1=DT, dt=DT, control=drain)
 
 
 def test_fibres_pull_along_their_direction():

@@ -2,17 +2,24 @@
 part."""
 
 import warnings
+from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import thorough
+from scipy.stats import t as student
 from test_fit import DT, NOISE, RATIO, experiment, tracks
 
 import mpmjax as mpm
-from mpmjax.fitting._discretisation import CoarseGrid, unexplained
+from mpmjax.fitting._discretisation import CoarseGrid, look_at_coarse_grid, unexplained
 from mpmjax.fitting._estimate import shape_of, strongest_mode
+from mpmjax.fitting._evaluation import Evaluation
+from mpmjax.fitting._problem import FitProblem
+from mpmjax.fitting._result import fit_result
+from mpmjax.fitting._search import Search
 from mpmjax.verification import StandingWave, discretise
 
 E, SIDE = 7e4, 0.4
@@ -111,10 +118,41 @@ def test_residuals_that_are_no_noise_are_named(both_grids):
             assert stiff.interval[0] < E < stiff.interval[1]
             r = found.residuals.reshape(80, 2)
             strongest = np.linalg.eigvalsh(r.T @ r)[-1] - (np.sqrt(80) + np.sqrt(2)) ** 2
-            wider = max(160 / seen.worth * min(seen.misfit, 1) ** 2, strongest if seen.is_beyond else 1)
-            assert stiff.error == pytest.approx(np.sqrt(wider if shape else 1) * stiff.noise_error, rel=0.01)
+            mode, alike = strongest if seen.is_beyond else 1, 160 / seen.worth * min(seen.misfit, 1) ** 2
+            assert stiff.error == pytest.approx(np.sqrt(max(mode, alike) if shape else 1) * stiff.noise_error, rel=0.01)
+            # a correlation is known from few numbers, the strongest mode is a size
+            few, reach = shape and alike > mode, np.log(stiff.interval[1] / stiff.interval[0]) / 2
+            freedom = max(seen.worth, 4) if few else 1e9 if sigma else 159
+            assert reach * stiff.value == pytest.approx(student.ppf(0.975, freedom) * stiff.error, rel=0.01)
             assert f"{seen.worth:.2g} independent numbers" in table or not shape
             assert seen.is_beyond == (bool(shape) if sigma is None else shape == "a ramp")
+            again = partial(fit_again, found)
+            if sigma is None:  # a weight of all data alike changes no error, whatever the misfit
+                problem = eqx.tree_at(lambda p: p.experiments[0].observations[0].weight, found.problem, 4.0)
+                assert again(problem, 2.0)["E"].error == pytest.approx(stiff.error, rel=1e-6)
+            if not shape:  # a misfit that is smaller than the noise makes no error smaller
+                small = again(found.problem, 0.5)["E"]
+                assert small.error == pytest.approx(small.noise_error, rel=1e-9)
+            if not (shape or sigma):  # nor does the grid, with more freedom than the noise, an interval narrower
+                coarse = CoarseGrid(np.array([2 * found.uncertainty.error, [0.0]]), found.residuals)
+                more = again(found.problem, 1.0, coarse, freedom=1.0)["E"]
+                assert more.error == pytest.approx(np.sqrt(2) * more.noise_error, rel=1e-6)
+                assert more.interval == more.noise_interval
+            if seen.is_beyond:  # what twice the spacing explains of the residuals is no strongest mode
+                coarse = CoarseGrid(np.zeros((2, 1)), np.concatenate([2 * r[:, :1], r[:, 1:]], axis=1).reshape(-1))
+                rest = unexplained(found.residuals, found.jacobian, coarse).reshape(80, 2)
+                left = np.linalg.eigvalsh(rest.T @ rest)[-1] - (np.sqrt(80) + np.sqrt(2)) ** 2
+                assert left < 0.9 * strongest
+                error = again(found.problem, 1.0, coarse)["E"].error
+                assert error == pytest.approx(np.sqrt(max(alike, left)) * stiff.noise_error, rel=0.01)
+
+
+def fit_again(found, problem, factor, coarse=None, freedom=None):
+    """The result at the same minimum, of another problem whose residuals are those of the fit times a factor."""
+    known = Evaluation(0.0, found.z, factor * found.residuals, factor * found.jacobian)
+    end = Search(jnp.asarray(found.z), None, known, (), converged=True)
+    freedom = float(found.degrees_of_freedom) if freedom is None else freedom
+    return fit_result(problem, found.optimiser, end, [(*found.sigmas, 1.0, freedom)], {}, found.level, coarse)
 
 
 def test_correlated_numbers_are_worth_what_theory_says():
@@ -151,7 +189,9 @@ def test_misfit_that_is_like_the_change_on_twice_the_spacing_is_explained():
 def test_the_strongest_mode_is_that_of_a_discrepancy_and_none_of_noise():
     rng = np.random.default_rng(0)
     mode, white = np.outer(np.sin(np.arange(80)), np.ones(12)), rng.normal(size=(200, 80, 12))
-    assert np.mean([strongest_mode(rows) for rows in white]) < 0.1 * 12
+    strengths = [strongest_mode(rows) for rows in white]
+    assert min(strengths) == 0
+    assert np.mean(strengths) < 0.1 * 12
     assert strongest_mode(5 * mode + white[0]) == pytest.approx(25 * (mode**2).sum(), rel=0.05)
 
 
@@ -165,6 +205,66 @@ def test_the_first_interval_holds_what_the_grid_gets_wrong(both_grids, steps):
     assert found.interval[0] < E < found.interval[1]
     assert abs(found.value - E) > 4 * found.noise_error
     assert found.interval[1] - found.interval[0] < 16 * abs(found.value - E)
+
+
+class Lattice(eqx.Module):
+    """A grid of which nothing is known but how coarse it is."""
+
+    spacing: float = eqx.field(static=True, default=1.0)
+
+    def coarsened(self):
+        return Lattice(2 * self.spacing)
+
+
+class Bench(eqx.Module):
+    """A scene of that grid alone."""
+
+    grid: Lattice = Lattice()
+
+
+class Ran(eqx.Module):
+    """An experiment of five steps."""
+
+    scene: Bench = Bench()
+    t1: float = eqx.field(static=True, default=1.0)
+    dt: float = eqx.field(static=True, default=0.2)
+    steps = 5
+
+
+class Along(FitProblem):
+    """r = (b f(z/b), 1): b is 0.4 on twice the spacing, and 0.1 with three steps there, zero on the grid itself."""
+
+    of: Callable = eqx.field(static=True)
+
+    def __init__(self, of):
+        self.experiments, self.names, self.parameters, self.starts = (Ran(),), ("z",), (RATIO,), (jnp.zeros(()),)
+        self.of = of
+
+    @property
+    def dtype(self):
+        return jnp.float64
+
+    def residuals(self, z, sigmas, adjoint):
+        (e,) = self.experiments
+        b = 0.4 * (e.scene.grid.spacing - 1) - 0.3 * (round(e.t1 / e.dt) == 3)
+        return jnp.stack([b * self.of(z[0] / b), jnp.ones(())]), jnp.zeros(1)
+
+
+@pytest.mark.parametrize(
+    ("of", "by_spacing", "by_step"),
+    [
+        # z − b/1.2 is multiplied by 1 − 1.2 in each of three steps
+        (lambda x: 1.2 * x - 1, 0.4 / 1.2 * (1 + 0.2**3), (0.1 / 1.2 - 0.336) * (1 + 0.2**3)),
+        (lambda x: 3 * x - 1, 0.4, 0.1 - 3 * 0.4),
+        (lambda x: jnp.interp(x, jnp.array([0.0, 0.5, 1.0]), jnp.array([-1.0, 2.0, 0.5])), 0.4, -0.05),
+    ],
+    ids=["falls", "rises at once", "rises then"],
+)
+def test_the_look_at_twice_the_spacing_takes_three_steps_while_the_misfit_falls(of, by_spacing, by_step):
+    """By the Jacobian of the grid itself, 1; the first step stays in any case. The residuals are those of the start."""
+    coarse = look_at_coarse_grid(Along(of), jnp.zeros(1), (), np.array([[1.0], [0.0]]))
+    np.testing.assert_allclose(coarse.moved[:, 0], [by_spacing, by_step], rtol=1e-6)
+    np.testing.assert_allclose(coarse.residuals, [-0.4, 1.0])
 
 
 def wave(n):

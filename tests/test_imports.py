@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-import mpmjax
-
 PACKAGE = Path(__file__).parents[1] / "mpmjax"
 MAP = PACKAGE.parent / "CONTRIBUTING.md"
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
@@ -114,15 +112,17 @@ def test_files_are_small(name):
 
 
 def test_importing_changes_no_configuration_and_computes_nothing():
-    """In a fresh interpreter: jax's configuration is as before, no device has been started, and what a step does not
-    need is loaded with the first name that needs it."""
+    """In a fresh interpreter: a room loads with the first name that is used of it, jax's configuration is as before,
+    and no device has been started."""
     script = """
 import sys
+import mpmjax as mpm
+assert not {"jax", "numpy"} & set(sys.modules), "the package loads before it is used"
 import jax, equinox, lineax
 from jax._src import xla_bridge
 before = dict(jax.config.values)
 assert not xla_bridge.backends_are_initialized(), "a dependency starts a device"
-import mpmjax as mpm
+mpm.step, mpm.extensions
 late = {"diffrax", "h5py", "matplotlib", "optax", "optimistix", "PIL", "scipy", "tqdm", "typer"}
 assert not late & set(sys.modules), f"{late & set(sys.modules)} take long to import, and are for what uses them"
 for name in dir(mpm):
@@ -137,17 +137,3 @@ assert not hasattr(mpm, "fitt")
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=PACKAGE.parent)
     assert done.returncode == 0, done.stderr
-
-
-def test_type_checkers_see_the_names_that_are_loaded_late():
-    """They stand in the branch that only type checkers read, and in the table by which they are loaded."""
-    tree = ast.parse(FILES["__init__.py"].read_text())
-    (branch,) = (node for node in tree.body if isinstance(node, ast.If))
-    seen = {
-        f"{node.module}.{alias.name}".removeprefix("mpmjax.")
-        for node in branch.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    late = {f"{room}.{name}" for room, names in mpmjax._LATE.items() for name in names.split()}
-    assert seen - set(mpmjax._LATE) == late

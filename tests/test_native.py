@@ -1,5 +1,6 @@
 """The native sums are those of XLA to rounding, whatever they are given, and one place chooses between them."""
 
+import itertools
 import os
 import platform
 import subprocess
@@ -48,14 +49,14 @@ def problem(d, s, c, p, dtype, seed=0, *, wild=True, side=SIDE):
         first[:, 3] = rng.integers(-(2**31), 2**31, size=d)
     t = rng.uniform(-0.5, 0.5, (d, p)).astype(dtype)
     given, nodes = (rng.normal(size=shape).astype(dtype) for shape in ((d + 1, c, p), (side**d, c)))
-    return tuple(jnp.asarray(a) for a in (first, t, given, nodes))
+    return tuple(jnp.asarray(a, a.dtype) for a in (first, t, given, nodes))  # without a dtype: a program each
 
 
 def resistance(d, p, dtype, seed=0, *, wild=True, side=SIDE):
     """What `resist` is given: first nodes, offsets, upper triangles and a displacement."""
     first, t, _, u = problem(d, 3, d, p, dtype, seed, wild=wild, side=side)
     upper = np.random.default_rng(seed + 1).normal(size=(d * d * (d * d + 1) // 2, p)).astype(dtype)
-    return first, t, jnp.asarray(upper), u
+    return first, t, jnp.asarray(upper, dtype), u
 
 
 def resisted(first, t, upper, u):
@@ -179,12 +180,18 @@ def averaged(first, t, given, gradients, k=2, side=SIDE, s=3):
 @pytest.mark.parametrize("p", [45, *thorough(3000)])
 def test_wide_windows_agree(p, choose):
     """Of more nodes than a cache holds the library looks at those alone that particles reach: other ones each time."""
-    basis = basis_for(3, 3, side=70)
-    for seed in (0, 1, 0):
-        first, t, given, nodes = problem(3, 3, 3, p, "float32", seed, side=70)
-        assert nodes.nbytes > 2**21
-        agree(*by_each(choose, partial(summed, basis), first, t, given, nodes), "float32")
-        agree(*by_each(choose, partial(averaged, side=70), first, t, given[0], given[1:]), "float32")
+    problems = [problem(3, 3, 3, p, "float32", seed, side=70) for seed in (0, 1, 0)]
+    assert all(nodes.nbytes > 2**21 for *_, nodes in problems)
+
+    def both(first, t, given, nodes):
+        averages = averaged(first, t, given[0], given[1:], side=70)
+        return summed(basis_for(3, 3, side=70), first, t, given, nodes), averages
+
+    found = []
+    for name in ("native", "xla"):
+        choose(name)
+        found.append(list(itertools.starmap(jax.jit(both), problems)))
+    agree(*found, "float32")
 
 
 @NEEDS_LIBRARY

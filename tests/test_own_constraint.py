@@ -46,13 +46,13 @@ class Translating(AbstractConstraint):
         pass
 
     def at_start(self, scene, particles, nodes, planes):
-        rows, image = slice(*particles.groups[self.number].rows), OneVelocity(self.layer, scene.grid.layers)
+        rows, image = particles.groups[self.number].rows, OneVelocity(self.layer, scene.grid.layers)
         mass, rest = particles.mass[rows, None], jnp.zeros_like(image.own(nodes.conditions.velocity))
         velocity = (mass * particles.v[rows]).sum(axis=0) / mass.sum()
         return image, rest.at[0].set(velocity), rest != 0, rest
 
     def moved(self, before, after, image, fixed, new, mean, dt):
-        rows, deformations = slice(*before.groups[self.number].rows), list(after.deformations)
+        rows, deformations = before.groups[self.number].rows, list(after.deformations)
         deformations[self.number] = before.deformations[self.number]
         return dataclasses.replace(
             after,

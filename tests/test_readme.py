@@ -184,11 +184,3 @@ def test_messages_that_are_explained_are_said():
     quoted = re.findall(r'\*\*"(.*?)"\*\*', " ".join(PAGES["docs/faq.md"].read_text(encoding="utf-8").split()))
     assert len(quoted) > 10
     assert not [text for text in quoted if not any(text in each for each in texts)]
-
-
-def test_tests_that_the_parity_page_names_exist():
-    """Those in the last column of its table."""
-    rows = re.findall(r"^\|.*\| (`[^|]*`) \|$", PAGES["docs/parity.md"].read_text(encoding="utf-8"), re.MULTILINE)
-    names = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
-    assert len(names) > 20
-    assert not {name for name in names if not (ROOT / "tests" / f"test_{name}.py").exists()}

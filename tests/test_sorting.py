@@ -132,10 +132,10 @@ def test_particles_are_in_the_order_of_their_cells():
     state, order = eqx.filter_jit(_sorting.resorted)(order, scene, given, state, 0.0, jnp.asarray(0.0), None)
     cells = np.asarray(_sorting.cells_of(scene.kernel, scene.grid, scene.window(given), state.x))
     for group in given.groups:
-        assert (np.diff(cells[slice(*group.rows)]) >= 0).all()
+        assert (np.diff(cells[group.rows]) >= 0).all()
     assert (np.sort(order.number) == np.arange(given.count)).all()
     np.testing.assert_array_equal(state.x, given.x[order.number])
-    own = np.asarray(order.number[slice(*given.groups[1].rows)]) - given.groups[1].rows[0]
+    own = np.asarray(order.number[given.groups[1].rows]) - given.groups[1].rows.start
     np.testing.assert_array_equal(order.parameters[1].youngs_modulus, scene.laws[1].youngs_modulus[own])
     pulled = int(scene.loads[0].on.particle[0])
     np.testing.assert_array_equal(state.x[int(order.attached[0][0])], given.x[pulled])

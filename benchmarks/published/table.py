@@ -74,6 +74,15 @@ def pulled(run, scene, start):
     return np.array([f(axial) for axial in each for f in (np.min, np.max)])
 
 
+def pressed(run, scene, start):
+    """The inward displacement of the tube's outer surface [nm]: Lamé's, times the mean over the particles of their
+    radial displacement over his."""
+    x, (inner, outer) = np.asarray(start.x), (0.0125, 0.0375)
+    r = np.hypot(*x.T)
+    share = ((np.asarray(run.final.x) - x) * x).sum(axis=1) / r / -(r + inner**2 / r)
+    return np.array([1e9 * share.mean() * (outer + inner**2 / outer)])
+
+
 SCENES = {
     "hanging_bar": ("Tesserae.jl", "-1.2187 m", height),
     "taylor_bar": ("Kamoulakos 1990", "21.42 to 21.5 mm", length),
@@ -82,6 +91,7 @@ SCENES = {
     "sand_column": ("Tesserae.jl", "0.1184 m", height),
     "pressed_disk": ("Tesserae.jl", "23, -80 N/m", force),
     "dam_break": ("Tesserae.jl", "0.611, 0.288 m", mean),
+    "thick_walled_cylinder": ("cb-geo", "23.44 nm exact", pressed),
     "sliding_block": ("cb-geo", "1.987 m exact, 1.620 m", slid),
     "hydrostatic_column": ("cb-geo", "-1748.1 Pa exact, -1680.2 Pa", foot),
     "uniaxial_traction": ("cb-geo", "0.593, 0.597, 1.000, 1.000 Pa", pulled),

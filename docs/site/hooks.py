@@ -23,8 +23,9 @@ REFERENCE = {
 
 
 def _exported(room: str) -> list[str]:
-    """The public names of a room, by the imports of its `__init__.py`."""
-    tree = ast.parse((ROOT / "mpmjax" / room / "__init__.py").read_text(encoding="utf-8"))
+    """The public names of a room, by the imports of its `__init__.py`, or of the package, by those of its stub."""
+    stub = "__init__.py" if room else "__init__.pyi"
+    tree = ast.parse((ROOT / "mpmjax" / room / stub).read_text(encoding="utf-8"))
     aliases = [a for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for a in node.names]
     return [a.name for a in aliases if a.asname == a.name and not (ROOT / "mpmjax" / a.name).is_dir()]
 
@@ -44,7 +45,7 @@ def on_files(files: Files, config: Any) -> Files:
         files.append(File.generated(config, page, content=text))
     for name in ("LICENSE", "CITATION.cff"):
         files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
-    first = set(_exported("."))
+    first = set(_exported(""))
     for page, rooms in REFERENCE.items():
         files.append(File.generated(config, f"reference/{page}.md", content=_reference(page, rooms, first)))
     return files

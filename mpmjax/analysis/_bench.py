@@ -1,10 +1,9 @@
 """Timed runs of a scene, its motion by a method at a step and the seconds it takes, and the reference run among them.
 
-The reference is refined until it changes little or its time is up. If explicit steps are cheap it uses them, at the
-`stable_dt` of the whole motion, which resolves all that the grid does. Otherwise it uses TR-BDF2, and halves the step
-until that changes the motion by less than a third of the target error, or until the step is below the explicit limit.
-Then spacing and step are halved together: transfers act once a step, so on a given grid a smaller step alone need not
-improve the motion. The last change estimates the error of the reference run, safely from the first order on.
+The reference takes explicit steps where those are cheap, at the `stable_dt` of the whole motion, else TR-BDF2 with the
+step halved until that changes the motion by less than a third of the target error, or is below the explicit limit. Then
+spacing and step are halved together, as time allows: transfers act once a step, so on a given grid a smaller step need
+not improve the motion. The last change estimates the error, safely from the first order on.
 """
 
 import math

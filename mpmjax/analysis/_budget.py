@@ -42,7 +42,7 @@ def energy_of(scene: Scene, particles: Particles) -> Energy:
         speed2 = speed2 + (particles.C**2 * scene.stencil(particles).moment.T[:, None, :]).sum(axis=(1, 2))
     kinetic = particles.mass * speed2 / 2
     for constraint in scene.constraints:
-        rows = slice(*particles.groups[constraint.number].rows)
+        rows = particles.groups[constraint.number].rows
         fields = (particles.x, particles.v, particles.mass, particles.volume)
         kinetic = kinetic.at[rows].set(0).at[rows.start].set(constraint.kinetic_energy(*(a[rows] for a in fields)))
     gravity = jnp.asarray(scene.gravity, particles.x.dtype)
@@ -83,10 +83,9 @@ def pieces(scene: Scene, particles: Particles) -> int:
     """The number of pieces of the material. Particles with a common node of non-zero weight are of one piece; those
     without mass are of none.
 
-    Pieces exchange neither momentum nor stress. In the updated description a body falls apart, whatever its law, when
-    it is stretched until its particles lie further apart than the kernel reaches: *numerical fracture*. More pieces at
-    the end of a run than at its start are a sign of it, unless the material was meant to part. `TotalLagrangian` and
-    more particles a cell prevent it.
+    Pieces exchange neither momentum nor stress. In the updated description a body that is stretched until its particles
+    lie further apart than the kernel reaches falls apart, whatever its law: *numerical fracture*, of which more pieces
+    at the end of a run are a sign. `TotalLagrangian` and more particles a cell prevent it.
     """
     from scipy import sparse  # here, since they take long to import
     from scipy.sparse import csgraph
@@ -109,8 +108,8 @@ class EnergyBudget(eqx.Module):
     Δkinetic + Δelastic + Δpotential = boundary + friction + body_force + solver + time_integration + averaging
     − p2g − g2p − implicit − viscous − plastic.
 
-    Below, v̄ = (v^n + v^{n+1})/2 at the nodes and u_ip = v_p + C_p (x_i − x_p). Each term has its own expression, and
-    none is the remainder of the others. So if the budget closes to rounding, all of them are right.
+    Below, v̄ = (v^n + v^{n+1})/2 at the nodes and u_ip = v_p + C_p (x_i − x_p). No term is the remainder of the others:
+    if the budget closes to rounding, all of them are right.
     """
 
     kinetic: Float[Array, "*f"]  # change of the particles' kinetic energy, with that of their affine motion

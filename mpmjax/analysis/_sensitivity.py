@@ -51,22 +51,20 @@ def sensitivity(
 ) -> Sensitivity:
     """Tells whether gradients over this horizon are useful: the growth of a small change of the initial velocities.
 
-    The change δv0 is propagated to a change δx of the positions by forward-mode differentiation of the steps, and
-    measured against free flight:
+    The change δv0 is propagated to a change δx of the positions by forward-mode differentiation of the steps:
 
         growth(t) = ‖δx(t)‖ / (t ‖δv0‖),  ‖a‖² = Σ_p m_p a_p².
 
     It is 1 in free flight, and less with oscillation and damping. The default change is normally distributed and
-    independent for each particle, so its growth estimates the root mean square over all directions. (Of p particles
-    that stay together, only about a √p-th of it is common flight.) The gradient of a random function of the final
-    positions grows likewise, since ∂x/∂v0 and its transpose have the same singular values. Derivatives with respect to
-    other quantities that act through the motion (stiffness, gravity, positions) grow at the same rate.
+    independent for each particle, so its growth estimates the root mean square over all directions. Gradients of
+    functions of the final positions grow likewise (∂x/∂v0 and its transpose have the same singular values), and
+    derivatives by other quantities that act through the motion (stiffness, gravity, positions) at the same rate.
 
-    *When it warns*: at a growth beyond `warn_at`, or a fault of the run. Beyond `warn_at` the motion is chaotic (many
-    contacts, crumpling) or the step unstable. An exact gradient then holds only for changes of the order of 1/growth,
-    and is of no use to an optimiser. Shorten the horizon, observe averages, or reduce dt if the step is unstable.
+    *When it warns*: at a growth beyond `warn_at`, or a fault of the run. The motion then is chaotic (many contacts,
+    crumpling) or the step unstable. An exact gradient holds only for changes of the order of 1/growth, and is of no use
+    to an optimiser. Shorten the horizon, observe averages, or reduce dt if the step is unstable.
 
-    The cost is two to three runs, for a forward run and its tangent. The memory is that of the saved positions.
+    The cost is two to three runs, the memory that of the saved positions.
 
     Args:
         scene, particles, dt, method, start: as in `simulate`.

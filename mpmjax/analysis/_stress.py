@@ -19,10 +19,9 @@ from mpmjax.state import Particles, Scene, prepare, velocity_gradient
 def stress(scene: Scene, particles: Particles) -> Float[Array, "p 3 3"]:
     """The Cauchy stress σ of each particle [Pa], tension positive, shape (p, 3, 3).
 
-    σ = P Fᵀ/J + σ_v, of the elastic law for the present history, with the viscous stress where a law has one. Two
-    dimensions are plane strain and one is uniaxial strain, in which there are stresses normal to the plane or the line
-    too; of bodies of revolution the axes are r, z and around the axis. With averaged volumes it is the stress at F̄ (see
-    `AveragedVolume`). It is differentiable by all floats.
+    σ = P Fᵀ/J + σ_v, of the elastic law for the present history, with the viscous stress where a law has one, and with
+    averaged volumes at F̄ (see `AveragedVolume`). Two dimensions are plane strain and one is uniaxial strain, with
+    stresses normal to the plane or the line; of bodies of revolution the axes are r, z and around the axis.
 
     *When it breaks*: of material that yielding has loosened or torn, J counts the volume without its gaps. Stresses
     oscillate from particle to particle, by about as much as they are; `analysis.smoothed` averages them.

@@ -1,9 +1,8 @@
 """The error of a scene against seconds, by method, step and spacing, and the cheapest setting that is good enough.
 
-The error is that of the motion relative to a reference run. At eight evenly spaced times, take the RMS over particles
-of the difference between a particle's displacement and that in the reference run. The error is the largest of these,
-over the largest RMS displacement of the reference run. If that has k particles for one, the mean of the k nearest ones
-at time zero is used.
+The error is that of the motion: the largest of eight evenly spaced times of the RMS over particles of the difference
+from a reference run's displacement (where it has k particles for one, the mean of the k nearest at time zero), over the
+reference run's largest RMS displacement.
 """
 
 import itertools
@@ -102,14 +101,12 @@ def work_precision(
     """Run a scene by several methods on several grids, at smaller and smaller steps. A method and grid is done when it
     reaches the target error, gets no better, or costs more than another that reached it.
 
-    Implicit methods start with eight steps in all. Explicit ones start at the default safety of `stable_dt`, at the
-    largest stretch of the reference run on the scene's own grid, and once at twice that step, which should fail. A
-    method is not tried on finer grids if others on the scene's own grid have no larger error in no more seconds at all
-    of its steps. No grid is finer than that of the reference run.
+    Implicit methods start with eight steps in all; explicit ones at the `stable_dt` of the whole reference run, and
+    once at twice that, which should fail. A method is not tried on finer grids if others on the scene's own have no
+    larger error in no more seconds at all of its steps. No grid is finer than that of the reference run.
 
-    The seconds are those of this machine, so the result depends on more than the arguments. Two fifths of them are for
-    the reference run, and the rest is shared equally among methods. Runs that would take longer are foreseen from fewer
-    steps; methods that cannot be tried are named.
+    The seconds are those of this machine. Two fifths are for the reference run, the rest is shared equally among
+    methods. Runs that would take longer are foreseen from fewer steps; methods that cannot be tried are named.
 
     *When it breaks*: if refinement does not settle the motion (chaotic contact, PIC at long times), the reference is
     uncertain. Its `error` shows it.

@@ -227,7 +227,7 @@ def canonical(tree: Any, dtype: Any) -> Any:
             return leaf
         if isinstance(leaf, jax.Array):
             return jax.lax.convert_element_type(leaf, dtype)
-        return jnp.asarray(np.asarray(leaf, dtype))  # of a NumPy array: of a Python number XLA compiles a program
+        return jnp.asarray(np.asarray(leaf, dtype), dtype)  # else JAX compiles a program for it
 
     return jax.tree.map(convert, tree, is_leaf=lambda node: isinstance(node, lx.AbstractLinearSolver))
 

@@ -144,9 +144,8 @@ def _print_error(line: str) -> None:
 
 
 def _bytes(size: int | float) -> str:
-    return next(
-        f"{size / k:.3g} {unit}" for k, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")) if size >= k or k == 1e3
-    )
+    k, unit = next((k, unit) for k, unit in ((1e9, "GB"), (1e6, "MB"), (0, "kB")) if size >= k)
+    return f"{size / (k or 1e3):.3g} {unit}"
 
 
 def _summary(start: Particles, run: Run, taken: int = 0, seconds: float = 0.0) -> str:
@@ -357,9 +356,8 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
         zero = jnp.zeros(1, particles.x.dtype)
         problem = Problem(scene, particles, zero[0], Explicit())
         state = initial_state(problem)
-        frames = jax.tree.map(lambda a: a[None], state.particles)
-        shown = run_to(problem, state, 0, no_steps(particles.x.dtype), steps=zero, frames=frames)
-        render(shown, plot, colour=None)
+        frames = jax.tree.map(lambda a: a[None], state)
+        render(run_to(problem, state, 0, no_steps(particles.x.dtype), frames, steps=zero), plot, colour=None)
         say("written", str(plot))
 
 

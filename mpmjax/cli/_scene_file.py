@@ -232,8 +232,7 @@ def _lists(material: Any) -> list[str]:
 def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
     """The particles of all tables, those of each material together, in the materials' order."""
     filled: list[list[Particles]] = [[] for _ in scene.laws]
-    regions: list[AbstractRegion] = []
-    placed: list[np.ndarray] = []
+    placed: list[tuple[int, AbstractRegion, np.ndarray]] = []
     grid, dx = scene.grid, float(scene.grid.spacing)
     window, first, held = np.asarray(grid.shape) - 1, np.asarray(grid.origin) * dx, ~np.asarray(grid.periodic)
     for number, table in enumerate(tables, 1):
@@ -241,11 +240,9 @@ def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
         require(isinstance(table, dict), f"{where} must be a table, got {shortened(repr(table))}.")
         material, rest = table.get("material", 1), {key: value for key, value in table.items() if key != "material"}
         material = scene.names.index(material) + 1 if material in scene.names else material
-        one = (
-            f"the name of a [material.NAME], {', '.join(scene.names)}, or its number"
-            if scene.names
-            else f"the number of a [[material]], from 1 to {len(scene.laws)}"
-        )
+        one = f"the number of a [[material]], from 1 to {len(scene.laws)}"
+        if scene.names:
+            one = f"the name of a [material.NAME], {', '.join(scene.names)}, or its number"
         require(
             type(material) is int and material in range(1, len(scene.laws) + 1),
             f"{where} material must be {one}, got {shortened(repr(material))}.",
@@ -264,18 +261,19 @@ def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
                     + ": all lengths are in metres; enlarge the shape, move the origin, or use follow = true.",
                 )
             filled[material - 1].append(fill(grid=grid, dtype=dtype, **keys))
-            regions, placed = [*regions, region], [*placed, np.asarray(filled[material - 1][-1].x)]
+            placed.append((number, region, np.asarray(filled[material - 1][-1].x)))
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
-    for (i, region), (j, x) in itertools.product(enumerate(regions, 1), enumerate(placed, 1)):
+    for (i, region, _), (j, _, x) in itertools.combinations(placed, 2):
         lower, upper = region.bounds()
-        if i < j and ((x.min(axis=0) < upper) & (x.max(axis=0) > lower)).all():
-            inside = int(np.asarray(region.contains(jnp.asarray(x), -1e-3 * dx)).sum())  # deeper than rounding has it
-            if inside:
-                warn(
-                    f"{inside} particles of [[particles]] {j} lie in the region of [[particles]] {i}: where two fill "
-                    "the same place there is twice the mass."
-                )
+        if ((x.min(axis=0) >= upper) | (x.max(axis=0) <= lower)).any():
+            continue
+        inside = int(np.asarray(region.contains(jnp.asarray(x), -1e-3 * dx)).sum())  # deeper than rounding has it
+        if inside:
+            warn(
+                f"{inside} particles of [[particles]] {j} lie in the region of [[particles]] {i}: where two fill the "
+                "same place there is twice the mass."
+            )
     for number, sets in enumerate(filled):
         place = f"[material.{scene.names[number]}]" if scene.names else f"[[material]] {number + 1}"
         require(len(sets) > 0, f"{place} has no particles: name it in a [[particles]] table, or leave it out.")

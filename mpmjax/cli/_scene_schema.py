@@ -1,12 +1,16 @@
 """The JSON schema of scene files, by which editors complete and check them."""
 
-from typing import Any
+import enum
+import inspect
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, get_args, get_origin
 
+from mpmjax.checks import alternatives, is_class
 from mpmjax.cli._fit_file import fit_parameter, fit_settings
 from mpmjax.cli._measurements import KINDS, keys_of
 from mpmjax.cli._scene_file import RunSettings, particles_in
 from mpmjax.fitting import AbstractOptimiser
-from mpmjax.io import class_schemas, save, table_schema
+from mpmjax.io import MADE, classes_for, forms_of, known_classes, parameters_of, save
 from mpmjax.state import Scene, fill
 
 
@@ -16,27 +20,65 @@ def scene_schema() -> dict[str, Any]:
     def tables(each: dict[str, Any]) -> dict[str, Any]:
         return {"type": "array", "items": each}
 
-    particles = table_schema(fill, without=("grid", "dtype"))
+    particles = _table(fill, without=("grid", "dtype"))
     particles["properties"]["material"] = {"type": ["integer", "string"]}
-    run = table_schema(RunSettings)
+    run = _table(RunSettings)
     run["properties"]["method"]["anyOf"].append({"const": "auto"})
-    fit, text = table_schema(fit_settings), {"type": "string"}
+    fit, text = _table(fit_settings), {"type": "string"}
     fit["properties"] |= {
         "t1": {"type": "number"},
         "report": {"type": "object", "additionalProperties": text},
-        "parameter": tables(table_schema(fit_parameter, without=("experiments",))),
-        "observation": tables({"anyOf": [table_schema(keys_of(kind)[0], kind=kind) for kind in KINDS]}),
+        "parameter": tables(_table(fit_parameter, without=("experiments",))),
+        "observation": tables({"anyOf": [_table(keys_of(kind)[0], kind=kind) for kind in KINDS]}),
         "experiment": tables({"type": "object", "properties": {"scene": text}, "required": ["scene"]}),
     }
-    schema = table_schema(Scene)
+    schema = _table(Scene)
     schema["properties"] |= {
-        "particles": {"anyOf": [particles, tables(particles), table_schema(particles_in)]},
+        "particles": {"anyOf": [particles, tables(particles), _table(particles_in)]},
         "run": run,
-        "output": table_schema(save, without=("path", "run")),
+        "output": _table(save, without=("path", "run")),
         "fit": fit,
     }
     schema["required"] += ["particles", "run"]
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$defs": class_schemas(AbstractOptimiser),
-    } | schema
+    classes: dict[str, Callable] = {c.__name__: c for c in (*known_classes(), *classes_for([AbstractOptimiser]))}
+    classes |= {name: make for name, (make, _) in MADE.items()}
+    definitions = {name: _table(c, kind=name) for name, c in classes.items()}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "$defs": definitions} | schema
+
+
+def _table(function: Callable, without: Iterable[str] = (), kind: str | None = None) -> dict[str, Any]:
+    """The JSON schema of a table of a function's arguments; `kind` is its key of that name."""
+    parameters = {name: p for name, p in parameters_of(function).items() if name not in without}
+    properties = {name: _value(hint) for name, (hint, _) in parameters.items()}
+    required = [name for name, (_, default) in parameters.items() if default is inspect.Parameter.empty]
+    text = " ".join((function.__doc__ or "").split("\n\n")[0].split())
+    named = {} if kind is None else {"kind": {"const": kind}}
+    table = {"type": "object", "properties": named | properties, "additionalProperties": False}
+    return table | {"description": text, "required": required}
+
+
+def _value(hint: Any) -> dict[str, Any]:
+    """The JSON schema of what an annotation takes."""
+    json, options = {float: "number", int: "integer", bool: "boolean", str: "string"}, alternatives(hint)
+    words = [word for a in options if get_origin(a) is Literal for word in get_args(a)]
+    choices: list[dict[str, Any]] = [{"enum": words}] if words else []
+    for kind, depth in sorted(forms_of(hint), key=str):
+        if words and (kind, depth) == (str, 0):
+            continue
+        value: dict[str, Any] = {"type": json[kind]}
+        for _ in range(depth):
+            value = {"type": "array", "items": value}
+        choices.append(value)
+    for cls in classes_for(options):
+        choices.append({"$ref": f"#/$defs/{cls.__name__}"})
+        if all(default is not inspect.Parameter.empty for _, default in parameters_of(cls).values()):
+            choices.append({"const": cls.__name__})  # its kind alone
+        choices += [{"$ref": f"#/$defs/{name}"} for name, (_, result) in MADE.items() if result is cls]
+    for a in options:
+        if get_origin(a) is dict:  # of objects by their names
+            choices.append({"type": "object", "additionalProperties": _value(get_args(a)[1])})
+        if is_class(a, enum.Enum):
+            choices.append({"enum": [member.value for member in a]})
+        elif get_origin(a) in (tuple, list) and (item := _value(get_args(a)[0])) and not forms_of(a):
+            choices += [{"type": "array", "items": item}, item]
+    return {"anyOf": choices} if choices else {}

@@ -26,8 +26,8 @@ def save_scene(
     method: AbstractIntegrator = Explicit(),
     save_every: int = 1,
 ) -> None:
-    """Write a scene as a TOML file for the shell, for editors and `load_scene`, with the particles, which do not know
-    from which regions they were filled, in a run file beside it, `NAME.start.vtkhdf`:
+    """Write a scene as a TOML file for the shell, editors and `load_scene`, with the particles, which do not know from
+    which regions they were filled, in a run file beside it, `NAME.start.vtkhdf`:
 
         mpm.save_scene("heap.toml", scene, particles, t1=0.5, dt=1e-3)
         scene, particles, settings = mpm.load_scene("heap.toml")

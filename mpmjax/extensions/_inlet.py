@@ -23,7 +23,7 @@ def placed(scene: Scene, particles: Particles, chosen: Bool[Array, "p"], **new: 
 
     deformations, histories = [], []
     for law, group in zip(scene.laws, particles.groups, strict=True):
-        rows, old = slice(*group.rows), jnp.asarray(group.stored)
+        rows, old = group.rows, jnp.asarray(group.stored)
         none = law.measure.undeformed(scene.grid.strain_dim)
         rest = jnp.broadcast_to(jnp.asarray(none, old.dtype), old.shape)
         fresh = law.initial_history(components(rest))

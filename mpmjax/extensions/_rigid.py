@@ -205,7 +205,7 @@ class RigidConstraint(AbstractConstraint):
         where R is the rotation at the mean angular momentum I ω̄, and the spin at the end has the angular momentum after
         the step; of a body whose spin is prescribed, R is the rotation by Δt ω̄ and the spin is that.
         """
-        rows, body = slice(*before.groups[self.number].rows), self._body(before)
+        rows, body = before.groups[self.number].rows, self._body(before)
         end, over, dtype = image.own(new), image.own(mean), before.x.dtype
         R = rotation_of(body, body.inertia @ image.spin(over[1]), dt)
         momentum = body.inertia @ image.spin(end[1])
@@ -261,5 +261,5 @@ class RigidConstraint(AbstractConstraint):
         return (body.mass * (body.velocity**2).sum() + body.spin @ body.inertia @ body.spin) / 2
 
     def _body(self, particles: Particles) -> RigidBody:
-        rows = slice(*particles.groups[self.number].rows)
+        rows = particles.groups[self.number].rows
         return rigid_body(particles.x[rows], particles.v[rows], particles.mass[rows], particles.volume[rows])

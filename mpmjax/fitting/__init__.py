@@ -13,6 +13,7 @@ from mpmjax.fitting._columns import (
     stated_unit as stated_unit,
 )
 from mpmjax.fitting._estimate import AbstractFit as AbstractFit, Estimate as Estimate, NoiseEstimate as NoiseEstimate
+from mpmjax.fitting._evaluation import Evaluation as Evaluation
 from mpmjax.fitting._experiment import (
     AbstractObservation as AbstractObservation,
     Experiment as Experiment,
@@ -53,7 +54,7 @@ from mpmjax.fitting._quantities import (
     StressStretch as StressStretch,
 )
 from mpmjax.fitting._result import FitResult as FitResult
-from mpmjax.fitting._search import AbstractOptimiser as AbstractOptimiser, Evaluation as Evaluation
+from mpmjax.fitting._search import AbstractOptimiser as AbstractOptimiser
 from mpmjax.fitting._sequence import RefinedFit as RefinedFit, fit_refined as fit_refined, fit_staged as fit_staged
 from mpmjax.fitting._starts import Screening as Screening, Starts as Starts
 from mpmjax.fitting._uncertainty import Prediction as Prediction

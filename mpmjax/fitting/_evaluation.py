@@ -6,7 +6,7 @@ are transformed from outside: `jax.jvp` and `jax.vmap` then spare all numbers th
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -111,35 +111,20 @@ def _compared(
     return jnp.concatenate([*parts, of_priors]), jnp.stack([jnp.asarray(run.report) for run in runs])
 
 
-class Evaluated(eqx.Module):
-    """Residuals and Jacobian at a place, for an optimiser in the place of the problem that they are of."""
+class Evaluation(NamedTuple):
+    """Cost and derivatives at a place."""
 
-    place: Coordinates
-    r: Float[Array, "m"]
-    J: Float[Array, "m n"] | Float[np.ndarray, "m n"]
-    rooms: tuple[Float[Array, "2 n"], ...]  # see `FitProblem.room`: at the place, and where the search is
-    runs: tuple[Run, ...] = ()  # runs of the experiments, without what was observed
-
-    @property
-    def dtype(self) -> Any:
-        """The precision of the problem."""
-        return self.r.dtype
-
-    def jacobian(self, z: Coordinates, sigmas: Sigmas, mode: Any = None) -> tuple[Array, Array]:
-        """Residuals and Jacobian, see `FitProblem.jacobian`."""
-        return self.r, jnp.asarray(self.J)
-
-    def room(self, z: Coordinates) -> Float[Array, "2 n"]:
-        """Room at the place, or where the search was, see `FitProblem.room`."""
-        return jnp.where((z == self.place).all(), *self.rooms)
+    cost: Float[Array, ""]  # ½ Σ r²; NaN where a simulation failed
+    gradient: Coordinates  # derivative of the cost by the coordinates, shape (n,)
+    residuals: Float[Array, "m"] | None = None  # r [-], of an optimiser that uses them
+    jacobian: Float[Array, "m n"] | None = None  # their derivative
+    room: Float[Array, "2 n"] | None = None  # how far values can change until their bounds, see `FitProblem.room`
+    runs: tuple[Run, ...] = ()  # runs of the experiments, where they were a program of their own
 
 
-def evaluated(
-    problem: FitProblem, place: Coordinates, z: Coordinates, sigmas: Sigmas, kept: tuple[Kept, ...]
-) -> Evaluated:
-    """Residuals and Jacobian at a place, of a search that is at z, by forward mode; `kept` as of `parts_kept`."""
-    place, z = (jnp.asarray(a, problem.dtype) for a in (place, z))
-    rest = []
+def evaluated(problem: FitProblem, z: Coordinates, sigmas: Sigmas, kept: tuple[Kept, ...]) -> Evaluation:
+    """Residuals and Jacobian by forward mode, and the runs, without what was observed; `kept` as of `parts_kept`."""
+    z, rest = jnp.asarray(z, problem.dtype), []
 
     def along(tangent: Any) -> tuple[Any, Any]:
         def residuals(z: Coordinates) -> tuple[Any, Any]:
@@ -147,21 +132,29 @@ def evaluated(
             arrays, rest[:] = eqx.partition(tuple(replace(run, observed=None) for run in runs), eqx.is_array)
             return both, arrays
 
-        both, changes, arrays = jax.jvp(residuals, (place,), (tangent,), has_aux=True)
+        both, changes, arrays = jax.jvp(residuals, (z,), (tangent,), has_aux=True)
         return (both, arrays), changes
 
-    ((r, _), runs), (columns, unsolved) = in_batches(along, np.eye(len(place), dtype=place.dtype), len(place))
+    ((r, _), runs), (columns, unsolved) = in_batches(along, np.eye(len(z), dtype=z.dtype), len(z))
     J = np.where(np.asarray(unsolved).any(), np.nan, np.asarray(columns).T).astype(r.dtype)
-    return Evaluated(place, r, J, (problem.room(place), problem.room(z)), eqx.combine(runs, tuple(rest)))
+    return of_residuals(np.asarray(r), J, problem.room(z))._replace(runs=eqx.combine(runs, tuple(rest)))
+
+
+def of_residuals(r: Any, J: Any, room: Array) -> Evaluation:
+    """An evaluation by residuals and Jacobian, its sums in the precision of coordinates."""
+    exact = r.astype(float)
+    return Evaluation((exact**2).sum() / 2, J.T.astype(float) @ exact, r, J, room)
 
 
 def residuals_at(
     problem: FitProblem, points: Float[Array, "b n"], sigmas: Sigmas, kept: tuple[Kept, ...] | None
 ) -> Float[Array, "b m"]:
     """Residuals at some points together, without derivatives; `kept` as of `parts_kept`."""
-    if kept is None:
-        return _residuals_at_once(problem, points, sigmas)
-    return jax.vmap(lambda z: staged(problem, z, sigmas, kept)[0][0])(points)
+
+    def one(z: Coordinates) -> Array:
+        return (_residuals(problem, z, sigmas) if kept is None else staged(problem, z, sigmas, kept)[0])[0]
+
+    return jax.vmap(one)(points)
 
 
 def costs_at(
@@ -182,7 +175,4 @@ def costs_at(
     return costs
 
 
-@eqx.filter_jit
-def _residuals_at_once(problem: FitProblem, points: Float[Array, "b n"], sigmas: Sigmas) -> Float[Array, "b m"]:
-    """The residuals at some points together, in one program, which keeps no states."""
-    return jax.vmap(lambda z: problem.residuals(z, sigmas, diffrax.ForwardMode())[0])(points)
+_residuals = eqx.filter_jit(lambda problem, z, sigmas: problem.residuals(z, sigmas, diffrax.ForwardMode()))

@@ -17,6 +17,7 @@ from mpmjax._types import Scalar
 from mpmjax.checks import between, checked, require, warn
 from mpmjax.fitting._discretisation import look_at_coarse_grid
 from mpmjax.fitting._estimate import table
+from mpmjax.fitting._evaluation import Evaluation
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._log import recorded
 from mpmjax.fitting._optimiser import LBFGS, LevenbergMarquardt
@@ -26,7 +27,6 @@ from mpmjax.fitting._result import FitResult, Noise, fit_result, settle_noise
 from mpmjax.fitting._search import (
     NO_DERIVATIVE,
     AbstractOptimiser,
-    Evaluation,
     Iteration,
     Search,
     batch_size,
@@ -66,33 +66,28 @@ def fit(
         })
         print(result)
 
-    The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched, with
-    derivatives through every step and every implicit solve. A step at which a simulation fails is not taken. A σ that
-    is not given is estimated: as √(Σ r²/(m − n)), of several observations in rounds, each by its own misfit.
-
-    Where the misfit is beyond the noise, or residuals have a shape, other starts are tried (`starts`), and errors and
-    intervals hold it, those of the noise alone beside them (docs/fitting.md#intervals-that-hold). None of it sees what
-    a parameter can make up for: for that see `discretisation`.
-
-    Ctrl-C ends a fit after the iteration in progress, and it returns the best that it has, not converged.
+    The least sum of squares of (simulated − measured)/σ over all observations is searched, with derivatives through
+    every step and every implicit solve. A σ that is not given is estimated as √(Σ r²/(m − n)), of several observations
+    in rounds. Errors and intervals hold a misfit beyond the noise, those of the noise alone beside them
+    (docs/fitting.md#intervals-that-hold). Ctrl-C ends a fit after the iteration in progress: the best so far is
+    returned, not converged.
 
     Args:
         experiments: one or several, which share the parameters.
         parameters: what is fitted, by name.
         starts: from how many points it is searched, or which (`Starts`). "auto": where the misfit of the first search
-            is beyond the noise, 24 more points are looked at, a simulation each, and some searched from, until a misfit
-            is within it; `result.screening` has what they found. 1 searches from the first guess alone.
+            is beyond the noise, 24 more points are looked at, and some searched from, until a misfit is within it;
+            `result.screening` has what they found. 1 searches from the first guess alone.
         discretisation: whether to look at twice the spacing, and at twice the step there, by three runs each at most,
-            and count as errors how far the minimum moves, as the grid convergence index does. Without it nobody knows:
-            what parameters make up for leaves no misfit.
+            and count as errors how far the minimum moves. What parameters make up for leaves no misfit that tells.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
         optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, with few
             parameters or few measured numbers, else `LBFGS`.
         memory: for what reverse mode stores, and for the tangents of forward mode that are made at once [B].
         progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`.
-        log: an HDF5 file that is to hold each iteration (docs/fitting.md), and lacks at most the one in progress,
-            whatever ends the fit. It holds the first search, and the last one from another start.
+        log: an HDF5 file that holds each iteration (docs/fitting.md) but the one in progress, whatever ends the fit: of
+            the first search, and of the last one from another start.
         resume: continue the fit of the log, bit for bit. Only the optimiser's `max_steps` may differ.
 
     Raises:
@@ -115,19 +110,23 @@ def fit(
     starting_points(problem, unit_points(0, problem.size, 0), starts)  # those that cannot be are refused
     zeros, say, paired = jnp.zeros(problem.size, problem.dtype), progress or (lambda text: None), set[str]()
     with recorded(problem, optimiser, progress, None if log is None else Path(log), resume=resume) as (past, record):
-        first, earlier, sigmas, state = (0, (), problem.first_sigmas, None) if past is None else past
+        rounds, earlier, sigmas, state = (0, (), problem.first_sigmas, None) if past is None else past
 
-        def begun(noise: Sigmas, seen: Evaluation) -> None:
-            """Name what the data do not see, or not apart, by the first Jacobian."""
-            require_influence(problem, noise, seen)
-            if seen.jacobian is not None and not paired:
-                errors = uncertainty(np.asarray(seen.jacobian, float), float(jnp.finfo(problem.dtype).eps), ())
+        def iterated(noise: Sigmas, search: Search) -> None:
+            """Record an iteration; the first one names what the data do not see, or not apart."""
+            J = search.seen.jacobian
+            first = search.history[-1].number == 0
+            if first:
+                require_influence(problem, noise, search.seen)
+            if first and J is not None and not paired:
+                errors = uncertainty(np.asarray(J, float), float(jnp.finfo(problem.dtype).eps), ())
                 for text in seen_together(problem.labels, errors, problem.logarithmic):
                     paired.add(text.split(":")[0])
                     warn(f"At the first guess, {text}")
                     say(f"at the first guess, {text}")
+            record(noise, search)
 
-        descend = partial(_in_rounds, [problem], optimiser=optimiser, begun=begun, report=record)
+        descend = partial(_in_rounds, [problem], optimiser=optimiser, report=iterated)
 
         def resulted(end: Search, settled: Noise | None) -> FitResult | None:
             return None if settled is None else fit_result(problem, optimiser, end, settled, report, level)
@@ -139,7 +138,7 @@ def fit(
             result = resulted(end, settle_noise(problem, end, noise)[0])
             return result is not None and not result.is_beyond
 
-        ((end, settled, changing, noise),) = descend([sigmas], starts={0: zeros}, rounds=first, state=state)
+        ((end, settled, changing, noise),) = descend([sigmas], starts={0: zeros}, rounds=rounds, state=state)
         result = resulted(end, settled)
         history = (*earlier, *end.history)
         # The log of a fit that other starts have brought farther holds a search that begins where none ended.

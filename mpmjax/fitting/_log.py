@@ -26,12 +26,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax.checks import require
+from mpmjax.fitting._evaluation import Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas
-from mpmjax.fitting._search import AbstractOptimiser, Evaluation, Iteration, Search, begin
+from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
 from mpmjax.io import ReplacedFile, check_hdf5, reason, reporting
 
-_FORMAT = 2
+_FORMAT = 3
 _ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), ("accepted", "?"), ("seconds", "f8")]
 _MOST = 8  # numbers of an array that are written out
 _FREE = ("optimiser.max_steps",)  # choices that may differ in a fit that is continued: it may go on for longer
@@ -155,9 +156,9 @@ def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: d
             each: Any = [(n, Iteration(*i, z)) for (n, *i, _), z in zip(rows, places, strict=True)]  # pyright: ignore
             earlier, history = (tuple(i for n, i in each if (n == rounds - 1) is last) for last in (False, True))
             names = [name for name in Evaluation._fields if f"resume/seen/{name}" in arrays]
-            parts: dict[str, Any] = {name: jnp.asarray(arrays[f"resume/seen/{name}"]) for name in names}
+            parts: dict[str, Any] = {name: arrays[f"resume/seen/{name}"] for name in names}
             seen = Evaluation(**parts)
-            like = eqx.filter_eval_shape(begin, problem, optimiser, jnp.zeros(problem.size), noise[-1])
+            like = eqx.filter_eval_shape(optimiser.begin, problem, jnp.zeros(problem.size), noise[-1])
             shapes, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
             leaves, tree = jax.tree.flatten(shapes)
             state = []

@@ -1,5 +1,5 @@
-"""Methods that search the least sum of squares: Levenberg-Marquardt of optimistix by residuals and their Jacobian,
-L-BFGS and Adam of optax by the gradient alone."""
+"""Methods that search the least sum of squares: Levenberg-Marquardt by residuals and their Jacobian, L-BFGS and Adam of
+optax by the gradient alone."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,27 +10,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import optimistix
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import as_floats, positive, require_fields, require_positive, tolerance, whole
-from mpmjax.fitting._evaluation import Evaluated, parts_kept
+from mpmjax.fitting._evaluation import Evaluation, of_residuals
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
-from mpmjax.fitting._search import AbstractOptimiser, Evaluation
+from mpmjax.fitting._search import AbstractOptimiser, Search
 
 
 class LevenbergMarquardt(AbstractOptimiser):
-    """The Levenberg-Marquardt method of optimistix on the residuals and their Jacobian.
+    """The Levenberg-Marquardt method: steps −(JᵀJ + λ)⁻¹ Jᵀ r of the residuals r and their Jacobian J.
 
-    A step at which a simulation fails has residuals of NaN, is not taken, and the next is shorter.
+    λ is first one, the square of a coordinate's natural step; it falls by 3.5 where a step lowers Σ r² as foretold, and
+    grows fourfold where one does not lower it by a hundredth of that, or a simulation fails: that one is not taken. It
+    is larger where a number with a bound would move by more than 2 in its coordinate, a modulus sevenfold, or a quarter
+    of that for each refusal before: so far no straight line knows the way.
 
     Near a bound the coordinate hides the value from it: the damping then holds a step that the data ask for. There the
     next one is the Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds.
 
-    It ends by optimistix's criterion, or where the next Gauss-Newton step, no longer than to a bound, would be less
-    than a ten-thousandth of the standard error that the misfit gives, or where a step is refused and could lower the
-    sum of squares by no more than its rounding, as in single precision. Where only steps far shorter than the
-    Gauss-Newton step are taken, since the simulation fails beyond or the misfit has a kink, it has not converged.
+    It ends where a step changes nothing by more than the tolerance, where the next Gauss-Newton step, no longer than to
+    a bound, is less than a ten-thousandth of the standard error that the misfit gives, or where one is refused and
+    could lower Σ r² by no more than its rounding. Where only steps far shorter than the Gauss-Newton step are taken,
+    since the simulation fails beyond or the misfit has a kink, it has not converged.
 
     Args:
         rtol: relative and absolute tolerance of coordinates and residuals.
@@ -43,69 +45,66 @@ class LevenbergMarquardt(AbstractOptimiser):
     max_steps: Annotated[int, whole(1)] = eqx.field(static=True, default=300)
     mode: Literal["forward", "reverse"] | None = eqx.field(static=True, default=None)
 
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Any:
-        if parts_kept(problem, 1 + problem.size) is not None:
-            rows = problem.measured + len(jax.eval_shape(problem.prior_residuals, z.astype(problem.dtype)))
-        else:
-            rows = len(jax.eval_shape(lambda z: problem.jacobian(z.astype(problem.dtype), sigmas, self.mode), z)[0])
-        r, J, room = (jnp.zeros(shape, z.dtype) for shape in ((rows,), (rows, len(z)), (2, len(z))))
-        at, shape = Evaluated(z, r, J, (room, room)), jax.eval_shape(lambda: r)
-        return self._solver.init(_residuals, z, (at, (), None), {}, shape, None, frozenset())
+    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "DampedState":
+        no = jnp.asarray(False)
+        return DampedState(z, jnp.ones((), z.dtype), jnp.zeros((), jnp.int32), no, no)
 
-    def place(self, problem: FitProblem, state: Any) -> Coordinates | None:
-        return state.y_eval if (self.mode or problem.cheaper_mode) == "forward" else None
+    def place(self, problem: FitProblem, state: "DampedState") -> Coordinates | None:
+        return state.trial if (self.mode or problem.cheaper_mode) == "forward" else None
 
     def iterate(
-        self, problem: FitProblem | Evaluated, z: Coordinates, sigmas: Sigmas, state: Any
-    ) -> tuple[Coordinates, Any, Evaluation]:
-        z, state, _ = self._solver.step(_residuals, z, (problem, sigmas, self.mode), {}, state, frozenset())
-        r, J = state.f_info.residual, state.f_info.jac.as_matrix()
-        dtype = problem.dtype
-        room = problem.room(z.astype(dtype))
-        return z, state, Evaluation((r**2).sum() / 2, J.T @ r, r.astype(dtype), J.astype(dtype), room)
+        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "DampedState"
+    ) -> tuple[Coordinates, "DampedState", Evaluation]:
+        z = state.trial.astype(problem.dtype)
+        return state.trial, state, of_residuals(*problem.jacobian(z, sigmas, self.mode), problem.room(z))
 
-    def directed(self, z: Coordinates, state: Any, seen: Evaluation) -> Any:
-        r, J, step, _ = _gauss_newton(seen)
-        if not np.isfinite(step).all() or int(state.num_steps_since_acceptance) > 0:
-            return state
-        (down, up), square = np.asarray(seen.room, float), np.maximum((J**2).sum(axis=0), np.finfo(float).tiny)
-        near = square * np.minimum(down, up) ** 2 <= _HIDDEN**2 * (r**2).sum() / max(len(r) - len(step), 1)
-        side = np.where(down < up, 1, -1)
-        straight = side * np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1))
-        wanted = np.where(near, straight, step)
-        if not (near & (np.abs(np.asarray(state.y_eval) - np.asarray(z)) < np.abs(wanted) / 2)).any():
-            return state
-        # The factor is what a refusal takes off the length of steps: damped ones go on as if it had not been tried.
-        return eqx.tree_at(
-            lambda s: (s.y_eval, s.search_state.step_size),
-            state,
-            (z + jnp.asarray(wanted, z.dtype), state.search_state.step_size * 4),
-        )
+    def directed(
+        self, before: Search, z: Coordinates, state: "DampedState", seen: Evaluation
+    ) -> tuple[Coordinates, "DampedState", Evaluation]:
+        reach, refused, settled, tolerance = float(state.reach), 0, False, float(self.rtol)
+        if before.history:
+            (last, J), (r, _) = _exact(before.seen), _exact(seen)
+            moved = np.asarray(z - before.z, float)
+            # Near a bound the quadratic, of coordinates, may foretell a step uphill: none is taken.
+            foretold = min(((last + J @ moved) ** 2).sum() - (last**2).sum(), 0.0)
+            change = (r**2).sum() - (last**2).sum()
+            if change <= _LEAST_RATIO * foretold:
+                reach *= _LONGER if change < _GOOD_RATIO * foretold < 0 else 1
+                changes, sizes = np.append(moved, r - last), np.abs(np.append(z, r))
+                settled = bool((np.abs(changes) < tolerance * (1 + sizes)).all())
+            else:
+                z, seen, reach, refused = before.z, before.seen, reach / _SHORTER, int(state.refused) + 1
+        r, J = _exact(seen)
+        if not np.isfinite(J).all():
+            return z, state, seen
+        U, lengths, Vt = np.linalg.svd(J, full_matrices=False)
+        damping = 1 / np.clip(reach, *_REACHES)
+        damping = np.append(damping, np.maximum(damping, lengths[0] ** 2 * np.logspace(-16, 4, 81)))
+        steps = -Vt.T @ ((lengths * (U.T @ r))[:, None] / (lengths[:, None] ** 2 + damping))
+        short = (np.abs(steps[_bounded(seen)]) <= _FURTHEST / _SHORTER**refused).all(axis=0)
+        step = steps[:, short.argmax() if short.any() else -1]
+        wanted = np.abs(np.linalg.lstsq(J, -r)[0]).max()
+        held = wanted > _FAR * tolerance and np.abs(step).max() < _REFUSED * wanted
+        if not refused and (straight := _to_a_bound(seen, step)) is not None:
+            # If it is refused, damped steps go on as if it had not been tried.
+            step, reach = straight, reach * _SHORTER
+        after = np.asarray(z, float) + step, reach, refused, settled and not held, settled and held
+        kinds = (leaf.dtype for leaf in state)
+        return z, DampedState(*map(jnp.asarray, after, kinds)), seen
 
-    def has_converged(self, state: Any, seen: Evaluation) -> bool:
-        if (bool(state.terminate) and not self._is_held_back(state)) or self.distance(state, seen) <= 1:
+    def has_converged(self, state: "DampedState", seen: Evaluation) -> bool:
+        if state.settled or self.distance(state, seen) <= 1:
             return True
         # Refused, and what it could have lowered Σ r² by is lost in the rounding.
         r, J, step, _ = _gauss_newton(seen)
         rounding = _ROUNDINGS * float(np.finfo(np.asarray(seen.residuals).dtype).eps) * (r**2).sum()
         gain = (r**2).sum() - ((r + J @ step) ** 2).sum()
-        return bool(int(state.num_steps_since_acceptance) > 0 and gain <= rounding)
+        return bool(state.refused > 0 and gain <= rounding)
 
-    def has_stalled(self, state: Any) -> bool:
-        return bool(state.terminate) and self._is_held_back(state)
+    def has_stalled(self, state: "DampedState") -> bool:
+        return bool(state.stalled)
 
-    def _is_held_back(self, state: Any) -> bool:
-        """Whether the steps are short because longer ones were refused, and not because the minimum is near: the
-        simulation fails beyond, or the misfit has a kink."""
-        r, J = np.asarray(state.f_info.residual, float), np.asarray(state.f_info.jac.as_matrix(), float)
-        if not (np.isfinite(r).all() and np.isfinite(J).all()):
-            return False
-        damping = np.eye(J.shape[1]) / float(state.search_state.step_size)
-        wanted, taken = np.linalg.lstsq(J, -r)[0], np.linalg.solve(J.T @ J + damping, -J.T @ r)
-        far = np.abs(wanted).max() > _FAR * float(self.rtol)
-        return bool(far and np.abs(taken).max() < _REFUSED * np.abs(wanted).max())
-
-    def distance(self, state: Any, seen: Evaluation) -> float:
+    def distance(self, state: "DampedState", seen: Evaluation) -> float:
         r, J, step, limited = _gauss_newton(seen)
         rows, columns = J.shape
         if rows <= columns or not np.isfinite(step).all():
@@ -116,24 +115,51 @@ class LevenbergMarquardt(AbstractOptimiser):
         length = float(np.linalg.norm(J @ step))
         return length / max(_NEGLIGIBLE * float(error), least) if length > 0 else 0.0
 
-    @property
-    def _solver(self) -> Any:
-        tolerance: Any = self.rtol
-        solver: Any = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-        return eqx.tree_at(lambda s: s.search, solver, _TrustRegion())
+
+class DampedState(NamedTuple):
+    """State of Levenberg-Marquardt."""
+
+    trial: Coordinates  # where it looks next
+    reach: Float[Array, ""]  # one over the damping
+    refused: Int[Array, ""]  # how many steps in a row were refused
+    settled: Bool[Array, ""]  # whether the last step was within the tolerances
+    stalled: Bool[Array, ""]
+    """Whether it was so since longer ones were refused: the simulation fails beyond, or the misfit has a kink."""
 
 
-class _TrustRegion(optimistix.ClassicalTrustRegion):
-    """A trust region that takes no step uphill, though near a bound its quadratic, of coordinates, may foretell one."""
+def _exact(seen: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals and Jacobian in double precision."""
+    return np.asarray(seen.residuals, float), np.asarray(seen.jacobian, float)
 
-    def predict_reduction(self, y_diff: Any, f_info: Any) -> Any:
-        return jnp.minimum(super().predict_reduction(y_diff, f_info), 0)
+
+def _to_a_bound(seen: Evaluation, damped: np.ndarray) -> np.ndarray | None:
+    """The Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds, where damping
+    holds one beside a bound; else None."""
+    r, J, step, _ = _gauss_newton(seen)
+    if not np.isfinite(step).all():
+        return None
+    left, freedom = ((r + J @ step) ** 2).sum(), len(r) - len(step)
+    limit = _HIDDEN**2 * left / max(freedom, 1)  # of Δχ², by which chance puts a minimum beyond a bound
+    if freedom <= 0 or (r**2).sum() - left > limit * len(step):
+        return None  # Σ r² is no noise yet, and says nothing of errors
+    (down, up), square = np.asarray(seen.room, float), np.maximum((J**2).sum(axis=0), np.finfo(float).tiny)
+    near = square * np.minimum(down, up) ** 2 <= limit
+    side = np.where(down < up, 1, -1)
+    straight = side * np.minimum(np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1)), _LEAP)
+    wanted = np.where(near, straight, step)
+    return wanted if (near & (np.abs(damped) < np.abs(wanted) / 2)).any() else None
+
+
+def _bounded(seen: Evaluation) -> np.ndarray:
+    """Which numbers have a bound, and so coordinates in which they are bent."""
+    down, up = np.isfinite(np.asarray(seen.room))
+    return down | up
 
 
 def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """r, J, the next Gauss-Newton step, were values straight lines in their coordinates up to their bounds, NaN if it
     is unknown, and which coordinates it brings to a bound."""
-    r, J = np.asarray(seen.residuals, float), np.asarray(seen.jacobian, float)
+    r, J = _exact(seen)
     if not (np.isfinite(r).all() and np.isfinite(J).all()):
         return r, J, np.full(J.shape[1], np.nan), np.zeros(J.shape[1], bool)
     length = np.linalg.norm(J, axis=0)
@@ -147,24 +173,13 @@ def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     return r, J, step / length, (step <= -down) | (step >= up)
 
 
-def _residuals(z: Coordinates, args: tuple[FitProblem | Evaluated, Sigmas, Any]) -> tuple[Array, None]:
-    """The residuals, as optimistix asks for them."""
-    problem, sigmas, mode = args
-
-    def evaluate(z: Coordinates) -> tuple[Array, Array]:
-        r, J = problem.jacobian(z.astype(problem.dtype), sigmas, mode)
-        return r.astype(z.dtype), J.astype(z.dtype)
-
-    return evaluated_once(evaluate)(z), None
-
-
 class LBFGS(AbstractOptimiser):
     """The limited-memory BFGS method of optax with its zoom line search, on gradients by reverse mode.
 
-    An iteration is a line search: mostly one simulation with its gradient, whose cost does not grow with the number of
-    parameters. The first step is of length one at most. A step at which a simulation or its derivative fails counts as
-    infinitely bad. A line search that finds nothing lower is begun again along the negative gradient; where that finds
-    nothing either, the search ends, and has not converged.
+    An iteration is a line search: mostly one simulation with its gradient, whatever the number of parameters. The first
+    step is of length one at most. Where a simulation or its derivative fails the cost is infinite. A line search that
+    finds nothing lower is begun again along the negative gradient; where that finds nothing either, the search ends,
+    and has not converged.
 
     It ends where two line searches in a row bring the cost, ½ Σ r², less than `rtol`² σ² lower, foreseen and done,
     σ² = Σ r²/(m − n): some `rtol` standard errors from the minimum. Or where rounding hides what they bring.
@@ -277,9 +292,8 @@ def evaluated_once(evaluate: Callable[[Coordinates], tuple[Array, Array]]) -> Ca
 class Adam(AbstractOptimiser):
     """The Adam method of optax on gradients by reverse mode: for costs that are rough, where a line search is caught.
 
-    An iteration is one simulation with its gradient. The search keeps the best place that it has seen. Where a
-    simulation or its derivative fails, or `patience` iterations in a row find nothing lower, it goes back there and
-    begins anew, its steps half as long. It ends where these are shorter than `atol` coordinates.
+    An iteration is one simulation with its gradient. Where that fails, or `patience` iterations in a row find nothing
+    lower, it begins anew at the best place, its steps half as long, and ends where these are shorter than `atol`.
 
     Args:
         learning_rate: length of a step in each coordinate [-], 0.05 for five per cent of a `Positive` parameter, or a
@@ -360,8 +374,12 @@ def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
+_LEAST_RATIO, _GOOD_RATIO = 0.01, 0.99  # parts of the foretold decrease from which a step is taken, and reach grows
+_LONGER, _SHORTER = 3.5, 4.0  # factors of the reach where a step was as foretold, and where it is refused
+_REACHES = 1e-300, 1e300
 _FAR = 100.0  # a step is short below so many tolerances
 _REFUSED = 0.1  # part of the Gauss-Newton step below which a step is held back
+_FURTHEST = 2.0  # longest step of a coordinate with a bound [-]
 _LEAP = 9.0  # longest step to a bound [-]: to a ten-thousandth of the distance from it
 _HIDDEN = 3.0  # standard errors from a bound within which a coordinate is near it
 _NEGLIGIBLE = 1e-4  # a step of so many standard errors is none

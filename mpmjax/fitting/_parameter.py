@@ -392,7 +392,7 @@ class Field(AbstractParameter):
             each = zip(marked.scene.laws, particles.groups, strict=True)
             of_laws = [group.rows for law, group in each if any(leaf is mark for leaf in jax.tree.leaves(law))]
             # The particles to which the leaf belongs: those of its law, or all.
-            parts.append(values[slice(*(of_laws[-1] if of_laws else (0, particles.count)))])
+            parts.append(values[of_laws[-1] if of_laws else slice(None)])
         return eqx.tree_at(where, experiment, tuple(parts))
 
     def on_particles(self, x: ParticleVector, value: Value) -> ParticleScalar:

@@ -44,8 +44,8 @@ def predict(
 
     Args:
         result: the fit.
-        of: function of an experiment with the fitted parameters, that returns a number or an array. Give the runs in
-            it `adjoint=diffrax.ForwardMode()`: else those in little `checkpoint_bytes` have no forward derivative.
+        of: function of an experiment with the fitted parameters, that returns a number or an array; its runs take
+            `adjoint=diffrax.ForwardMode()`.
         experiment: the number of one that was fitted, or another one, into which the parameters are put, without those
             that belong to some experiments only.
         sigma: standard deviation of the noise of a new measurement, in the unit of the quantity; a number or an array
@@ -188,9 +188,8 @@ def bootstrap(
     fit's σ, fitted again, many times (the parametric bootstrap: B. Efron, R. J. Tibshirani, An Introduction to the
     Bootstrap, Chapman & Hall 1993, chapters 6.5 and 13).
 
-    It takes the model and independent noise for granted, and adds the curvature of the model and what bounds do.
-    `weight` and `robust` act in each fit; a prior's mean is drawn anew too. 200 repeats fix a standard error to 5 %, a
-    95 % interval less well.
+    It takes the model and independent noise for granted, and adds the model's curvature and what bounds do. `weight`
+    and `robust` act in each fit; a prior's mean is drawn anew too. 200 repeats fix a standard error to 5 %.
 
     Args:
         result: the fit.

@@ -79,13 +79,11 @@ def profile(
     where Δχ² is below a threshold: the quantile of χ² of one degree of freedom where the noise was given, of F(1, ν)
     where it was estimated with ν degrees of freedom (D. M. Bates, D. G. Watts, Nonlinear Regression Analysis and Its
     Applications, Wiley 1988, chapter 6; D. J. Venzon, S. H. Moolgavkar, Applied Statistics 37 (1988) 87,
-    doi 10.2307/2347496). Unlike the interval of the standard error it does not depend on the coordinate, and need be
-    neither symmetric nor finite. In a linear problem both are one.
+    doi 10.2307/2347496). It does not depend on the coordinate, and in a linear problem is that of the standard error.
 
-    From the estimate it goes to either side in steps of equal growth of √Δχ². Where the threshold is never reached the
-    interval is open, and where Δχ² jumps over it, as beyond a stable step, it ends there: a warning says so. The noise
-    is the fit's; where the misfit is beyond it, the threshold is larger by the square of what errors are. With a robust
-    or weighted observation it is approximate. One program is compiled for all numbers of a fit.
+    Where the threshold is never reached the interval is open, and where Δχ² jumps over it, as beyond a stable step, it
+    ends there: a warning says so. Where the misfit is beyond the noise, the threshold is larger by the square of what
+    errors are. With a robust or weighted observation it is approximate. One program is compiled for all numbers.
 
     Args:
         result: the fit.

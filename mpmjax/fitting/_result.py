@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from operator import attrgetter
 from typing import Any
 
 import jax
@@ -51,7 +50,7 @@ class FitResult(AbstractFit):
     sigmas: Sigmas  # the noise of each observation, given or estimated, in the data's unit
     residuals: np.ndarray  # residuals of all observations, then of priors, in units of their noise [-], shape (m,)
     jacobian: np.ndarray  # their derivative by the coordinates, shape (m, n)
-    uncertainty: Uncertainty  # covariance of the coordinates, and the directions that the data do not see
+    uncertainty: Uncertainty  # covariance, correlation, Fisher spectrum and its directions
     estimates: tuple[Estimate, ...]  # the fitted numbers, one for each entry of each parameter
     reported: tuple[Estimate, ...]  # the estimates that `report` asked for
     chi_squared: float  # Σ r², priors included
@@ -75,14 +74,6 @@ class FitResult(AbstractFit):
     def values(self) -> dict[str, np.ndarray]:
         """The value of each parameter, in its shape."""
         return self.problem.by_name(jnp.asarray(self.z, self.problem.dtype))
-
-    covariance = property(attrgetter("uncertainty.covariance"), doc="Covariance of the coordinates [-], shape (n, n).")
-    correlation = property(attrgetter("uncertainty.correlation"), doc="Correlation of the estimates, shape (n, n).")
-    spectrum = property(
-        attrgetter("uncertainty.spectrum"),
-        doc="Eigenvalues of the Fisher information JᵀJ, growing, shape (n,): 1/√λ is how far the direction is open.",
-    )
-    directions = property(attrgetter("uncertainty.directions"), doc="Their eigenvectors, one a column, shape (n, n).")
 
     @property
     def all(self) -> tuple[Estimate, ...]:
@@ -268,17 +259,17 @@ def fit_result(
         beyond, worth = missed or bool(kind and not is_given), o.count / factor
         noises.append(NoiseEstimate(o.name, float(size), not is_given, float(misfit), o.count, worth, kind, beyond))
     held, slope = at_bound(r, J, np.asarray(problem.room(z))), jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1]
-    gradient, columns = (J.T @ r) * held, [problem.numbers(z), problem.numbers(jnp.zeros_like(z)), held]
+    gradient, size = (J.T @ r) * held, np.abs(np.asarray(slope, float))
     noise_alone, errors = uncertainty(J, eps, of_noise), uncertainty(J, eps, of_misfit, moved)
-    for each in (errors, noise_alone):
-        seen = np.isfinite(each.error)
-        wider = np.where(seen, each.error, 1) / np.where(seen, noise_alone.error, 1)
-        ends = intervals(problem, z, each, gradient / wider**2, level)
-        columns += [np.abs(np.asarray(slope, float)) * each.error, np.stack(ends, axis=1)]
+    seen = np.isfinite(errors.error)
+    wider = np.where(seen, errors.error, 1) / np.where(seen, noise_alone.error, 1)
+    (lower, upper), alone = (
+        intervals(problem, z, each, gradient / by**2, level) for each, by in ((errors, wider), (noise_alone, 1.0))
+    )
     # Few degrees of freedom of the noise are more beside what the grid adds: an interval is never the narrower for it.
-    (lower, upper), (lowest, highest) = columns[4].T, columns[6].T
-    columns[4] = np.stack([np.minimum(lower, lowest), np.maximum(upper, highest)], axis=1)
-    numbers = zip(problem.labels, problem.owners, *(np.asarray(column).tolist() for column in columns), strict=True)
+    widest = np.minimum(lower, alone[0]), np.maximum(upper, alone[1])
+    by = size * errors.error, size * noise_alone.error
+    numbers = np.array([problem.numbers(z), problem.numbers(jnp.zeros_like(z)), *by, *widest, *alone], float).T.tolist()
     reported = []
     for name, of in report.items():
 
@@ -302,8 +293,10 @@ def fit_result(
         jacobian=J,
         uncertainty=errors,
         estimates=tuple(
-            Estimate(label, value, error, tuple(ends), owner.unit, start, bound, of_noise, tuple(noise_ends))
-            for label, owner, value, start, bound, error, ends, of_noise, noise_ends in numbers
+            Estimate(label, value, error, (a, b), owner.unit, start, bound, of_noise, (c, d))
+            for label, owner, bound, (value, start, error, of_noise, a, b, c, d) in zip(
+                problem.labels, problem.owners, held.tolist(), numbers, strict=True
+            )
         ),
         reported=tuple(reported),
         chi_squared=float((r**2).sum()),

@@ -3,7 +3,6 @@
 import abc
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,22 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float
+from mpmjax._types import Array
 from mpmjax.checks import require, require_fields, require_whole
-from mpmjax.fitting._evaluation import evaluated, parts_kept
+from mpmjax.fitting._evaluation import Evaluation, evaluated, parts_kept
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
-from mpmjax.simulation import Run
-
-
-class Evaluation(NamedTuple):
-    """Cost and derivatives at the place where an optimiser is."""
-
-    cost: Float[Array, ""]  # ½ Σ r²; NaN where a simulation failed
-    gradient: Coordinates  # derivative of the cost by the coordinates, shape (n,)
-    residuals: Float[Array, "m"] | None = None  # r [-], of an optimiser that uses them
-    jacobian: Float[Array, "m n"] | None = None  # their derivative
-    room: Float[Array, "2 n"] | None = None  # how far values can change until their bounds, see `FitProblem.room`
-    runs: tuple[Run, ...] = ()  # runs of the experiments, where they were a program of their own
 
 
 class AbstractOptimiser(eqx.Module):
@@ -57,11 +44,14 @@ class AbstractOptimiser(eqx.Module):
 
     def place(self, problem: FitProblem, state: Any) -> Coordinates | None:
         """The one place at which the next iteration asks the problem for residuals and Jacobian, where that is all it
-        asks for: programs of their own then compute them. Default: None, an iteration is one program."""
+        asks for: programs of their own then compute them, in the place of `iterate`. Default: None."""
 
-    def directed(self, z: Coordinates, state: Any, seen: Evaluation) -> Any:
-        """The state for the next iteration, outside of what is compiled. Default: as it is."""
-        return state
+    def directed(
+        self, before: "Search", z: Coordinates, state: Any, seen: Evaluation
+    ) -> tuple[Coordinates, Any, Evaluation]:
+        """An iteration's outcome as the search takes it from where it was `before`, outside of what is compiled.
+        Default: as it is."""
+        return z, state, seen
 
     def distance(self, state: Any, seen: Evaluation) -> float:
         """How far the search is from converged, as a multiple of where it ends, by which the time left is estimated;
@@ -118,7 +108,6 @@ def search_many(
     done: Mapping[int, Search] | None = None,
     enough: Callable[[Search], bool] = lambda search: False,
     progress: Callable[[int, int], None] = lambda done, count: None,
-    begun: Callable[[Sigmas, Evaluation], None] = lambda sigmas, seen: None,
     report: Callable[[Sigmas, Search], None] = lambda sigmas, state: None,
 ) -> dict[int, Search]:
     """The least Σ r² of searches that differ in where they start or in their data, by their numbers.
@@ -137,8 +126,7 @@ def search_many(
         done: earlier searches, by their numbers, which are returned with the others.
         enough: says of each search that has ended whether those that wait need not begin; they are left out.
         progress: called with how many are done, and of how many.
-        begun: called with the noise of a search and the evaluation where it starts, unless it fails there.
-        report: called with the noise and the search after each iteration.
+        report: called with the noise and the search after each iteration that did not fail.
     """
     waiting, done, stacked = deque(starts), dict(done or {}), _stacked(problems)
     before, unseen = len(done), Evaluation(jnp.zeros(()), jnp.zeros(0))
@@ -193,16 +181,14 @@ def search_many(
             while waiting and len(running) < batch:
                 k = waiting.popleft()
                 problem, sigmas = problem_of(k)
-                z = jnp.asarray(starts[k], float)  # optimistix's own numbers are of JAX's default precision
-                running[k] = Search(z, begin(problem, optimiser, z, sigmas), unseen, ())
+                z = jnp.asarray(starts[k], float)
+                running[k] = Search(z, optimiser.begin(problem, z, sigmas), unseen, ())
             if not running:
                 return dict(sorted(done.items()))
             running = _iterated(running, problem_of, stacked, optimiser, batch)
             for k, search in running.items():
                 if np.isfinite(search.cost) and np.isfinite(search.history[-1].gradient):
                     _, sigmas = problem_of(k)
-                    if len(search.history) == 1:
-                        begun(sigmas, search.seen)
                     report(sigmas, search)
     except KeyboardInterrupt:
         for k in [k for k, search in running.items() if search.history]:
@@ -237,10 +223,10 @@ def _iterated(
         ends = [(jnp.asarray(z), eqx.combine(part, rest), seen) for z, part, seen in each]
     after = {}
     for (k, search), (z, inner, seen) in zip(running.items(), ends, strict=True):
+        z, inner, seen = optimiser.directed(search, z, inner, seen)
         cost, slope, history = float(seen.cost), float(np.abs(seen.gradient).max()), search.history
         iteration = Iteration(len(history), cost, slope, not history or cost != history[-1].cost, np.asarray(z))
-        seen = seen if seen.runs else seen._replace(runs=search.seen.runs)
-        after[k] = Search(z, optimiser.directed(z, inner, seen), seen, (*history, iteration))
+        after[k] = Search(z, inner, seen, (*history, iteration))
     return after
 
 
@@ -295,22 +281,14 @@ def counted(progress: Callable[[str], None] | None, text: str, *, again: bool = 
     return say
 
 
-@eqx.filter_jit
-def begin(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas) -> Any:
-    """An optimiser's `begin`, compiled."""
-    return optimiser.begin(problem, z, sigmas)
-
-
 def iterate(
     problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas, inner: Any
 ) -> tuple[Coordinates, Any, Evaluation]:
-    """An optimiser's `iterate`, compiled, or what it asks for and then what it makes of that."""
+    """An optimiser's `iterate`, compiled, or what it asks for."""
     place = optimiser.place(problem, inner)
     if place is None or (kept := parts_kept(problem, 1 + problem.size)) is None:
         return iterate_alone(problem, optimiser, z, sigmas, inner)
-    at = evaluated(problem, place, z, sigmas, kept)
-    z, inner, seen = iterate_alone(replace(at, runs=()), optimiser, z, (), inner)
-    return z, inner, seen._replace(runs=at.runs) if np.array_equal(z, place) else seen
+    return place, inner, evaluated(problem, place, sigmas, kept)
 
 
 @eqx.filter_jit
@@ -340,8 +318,8 @@ def iterate_together(
 def jacobian(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array]:
     """The residuals and their Jacobian, compiled."""
     if problem.cheaper_mode == "forward" and (kept := parts_kept(problem, 1 + problem.size)) is not None:
-        at = evaluated(problem, z, z, sigmas, kept)
-        return at.r, jnp.asarray(at.J)
+        at = evaluated(problem, z, sigmas, kept)
+        return jnp.asarray(at.residuals), jnp.asarray(at.jacobian)
     return _jacobian(problem, z, sigmas)
 
 

@@ -22,7 +22,7 @@ from mpmjax.fitting._observation import Series
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import FitResult
-from mpmjax.fitting._search import AbstractOptimiser, begin, iterate, jacobian, search
+from mpmjax.fitting._search import AbstractOptimiser, jacobian, search
 from mpmjax.fitting._starts import Starts, as_starts
 from mpmjax.fitting._uncertainty import quantile
 
@@ -46,17 +46,15 @@ def fit_staged(
         result = mpm.fitting.fit_staged(swing, {"E": ...})
         print(result)  # how the horizons were chosen, the stages (`result.remarks`), the estimate
 
-    *The first horizon*, where `horizons` does not give it, is the last time until which a change of one in any
-    coordinate changes the data by no more than they change themselves, √Σ (∂y/∂z)² ≤ √Σ (y − y(0))², by the derivative
-    at the first guess: of a vibration about half a period. Where that ratio does not grow with time, as of a drop
-    under gravity, there is but one stage. Horizons then double.
+    The first horizon, where `horizons` does not give it, is the last time until which a change of one in any coordinate
+    changes the data by no more than they change themselves, √Σ (∂y/∂z)² ≤ √Σ (y − y(0))², at the first guess: of a
+    vibration about half a period. Where that ratio does not grow with time, as of a drop under gravity, there is but
+    one stage. Horizons then double, to the end, or to the time until which `sensitivity`, at each stage's values, is
+    below `growth`: later data are left out, and a warning says so.
 
-    *The last horizon* is the experiment's end, or the time until which `sensitivity` is below `growth`: later data are
-    left out, and a warning says so. It is measured again at each stage's values.
-
-    The last stage is a `fit`. Those before it are searches alone: parameters that the data do not see yet stay where
-    they are. Each stage compiles anew. What has no times, such as a `Curve`, counts in the last stage, or in all if its
-    experiment has nothing else.
+    The last stage is a `fit`, those before it are searches alone: parameters that the data do not see yet stay. Each
+    compiles anew. What has no times, such as a `Curve`, counts in the last stage, or in all if its experiment has
+    nothing else.
 
     Args:
         experiments, parameters, report, level: see `fit`. Horizons are times of each experiment.
@@ -87,7 +85,7 @@ def fit_staged(
     limits = _limits(problem.at(z), float(growth))
     whole = _cut(problem, limits, end)
     if times is None:
-        first = _first_horizon(whole, optimiser, z)
+        first = _first_horizon(whole, z)
         times = [first * 2.0**k for k in range(_MOST_STAGES) if first * 2.0**k < _NEARLY_ALL * end]
         tell(
             f"The first horizon is {first:.4g} s of {end:.4g} s: until then a change of one in a coordinate changes "
@@ -142,14 +140,12 @@ def _limits(experiments: Sequence[Experiment], growth: float) -> list[float]:
     return limits
 
 
-def _first_horizon(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates) -> float:
+def _first_horizon(problem: FitProblem, z: Coordinates) -> float:
     """The time until which the data are nearly linear in the coordinates [s], see `fit_staged`."""
-    sigmas, start = problem.first_sigmas, z.astype(float)
-    _, _, seen = iterate(problem, optimiser, start, sigmas, begin(problem, optimiser, start, sigmas))
-    if not np.isfinite(seen.cost):
+    sigmas, parts = problem.first_sigmas, []
+    r, J = (np.asarray(a, float) for a in jacobian(problem, z, sigmas))
+    if not np.isfinite(r).all():
         problem.explain(z)
-    J = np.asarray(jacobian(problem, z, sigmas)[1] if seen.jacobian is None else seen.jacobian, float)
-    parts = []
     for o, rows, sigma in zip(problem.observations, problem.rows, sigmas, strict=True):
         if isinstance(o, Series):
             change = (J[rows] ** 2).reshape(len(o.times), -1, problem.size).sum(axis=1)
@@ -226,25 +222,22 @@ def fit_refined(
         print(mpm.fitting.fit_refined(build, {"E": ...}))
 
     With estimates a and b on the two finest grids, logarithms of `Positive` parameters, and spacings in the ratio r,
-    the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and that whole correction is taken as the standard
-    error that is left of the discretisation. p is `order`; with three grids of equal ratios it is what they show,
-    between half and twice that, but the error is no less than by `order`, for grids may be too coarse to tell. Where
-    the estimates do not converge, or one is at its bound, the finest stays, its last change the error, with a warning.
+    the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and that whole correction is the standard error that
+    is left of the discretisation. p is `order`; three grids of equal ratios show it, between half and twice that, but
+    the error is no less than by `order`. Where the estimates do not converge, or one is at its bound, the finest stays,
+    its last change the error, with a warning.
 
-    Two estimates may agree by chance and both be wrong. What the finest grid misses of the data then tells more: D, in
-    units of σ. A discretisation that changes predictions by D in ways that no parameter can follow may do as much in
-    ways that one does follow, which moves it by D times its standard error from the noise; half of this is the least
-    error that is taken. D² is what Σ r² loses from the grid before to the finest, over r^2p − 1, and needs no σ.
+    Two estimates may agree by chance, so the error is at least D/2 of those from the noise, D being what the finest
+    grid misses of the data, in units of σ: a discretisation that changes predictions by D in ways that no parameter
+    follows may do as much in ways that one does. D² is what Σ r² loses from the grid before, over r^2p − 1.
 
-    Intervals hold the noise's and the discretisation's part, and keep to the bounds. After Ctrl-C it returns what it
-    has, and extrapolates from grids on which the fit was done.
+    Intervals hold both parts, and keep to the bounds. After Ctrl-C it extrapolates from grids whose fit was done.
 
     Args:
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
         refinements: the n, growing, two at least. Each fit starts from the one before.
         order: p, the order in the spacing. One is careful: estimates that converge faster get a wider interval.
-        starts: of the first grid, see `fit`. Finer ones start from all minima of the one before, and from others, where
-            their misfit is beyond the noise.
+        starts: of the first grid, see `fit`. Finer ones start from all minima of the one before, and if need be others.
         parameters, report, level, optimiser, progress, resume: see `fit`.
         log: the name of the logs, one a grid: of "fit.h5" they are "fit_1.h5", "fit_2.h5". See `fit`.
 

@@ -26,19 +26,19 @@ class Starts(eqx.Module):
         result = mpm.fit(pull, {"E": ...}, starts=mpm.fitting.Starts(64, ranges={"E": (1e4, 1e7)}))
         print(result)
 
-    The points are the first guess, `points` of your own, and scrambled Sobol points (see `ranges`), with a simulation
-    each, without derivatives. Searches start from the first guess, your own points, a fraction of the others, the best
-    ones, and from each without a better one within the critical distance of multi-level single linkage (A. H. G.
-    Rinnooy Kan, G. T. Timmer, Mathematical Programming 39 (1987) 57-78). They stand for the others, each linked to the
-    nearest better one, and linked anew where that search comes to no minimum. What fails hinders no others.
+    The points are the first guess, `points` of your own, and scrambled Sobol points (see `ranges`), a simulation each.
+    Searches start from the first guess, your own points, the best of the others, and from each without a better one
+    within the critical distance of multi-level single linkage (A. H. G. Rinnooy Kan, G. T. Timmer, Mathematical
+    Programming 39 (1987) 57-78). They stand for the others, each linked to the nearest better one, and linked anew
+    where that search comes to no minimum.
 
-    A search that comes within a hundredth, in each coordinate, of another with a lower cost is ended, and counted where
-    that one ends; one whose sum of squares three moves, or six iterations, have lowered by less than a hundredth is
-    ended as at a minimum. Those within twice the least sum of squares are searched on, and the best is then fitted.
+    A search within a hundredth, in each coordinate, of another with a lower cost is ended, and counted where that one
+    ends; one whose sum of squares three moves, or six iterations, have lowered by less than a hundredth is ended as at
+    a minimum. Those within twice the least sum of squares are searched on, and the best is then fitted.
 
-    Two searches ended at one minimum where their coordinates differ by less than two hundredths, or the misfit hides
-    the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, with J and s² = Σ r²/(m − n) of the better one, s² at least one
-    where σ is given. Where it is not, all searches take that of the first one.
+    Two ended at one minimum where their coordinates differ by less than two hundredths, or the misfit hides that:
+    Δᵀ JᵀJ Δ ≤ n s² of n coordinates, with J and s² = Σ r²/(m − n) of the better one, s² at least one where σ is given.
+    Where it is not, all searches take that of the first one.
 
     Args:
         count: how many points, the first guess among them, your own not.
@@ -289,14 +289,13 @@ def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], frac
     """For each point the number of the one that stands for it, from which a search starts; its own where one starts
     there, and -1 where the cost is not finite.
 
-    In multi-level single linkage a search starts from each point that has no better one within the critical distance;
-    any other is linked to the nearest better one, and so on to one that is searched from. On a rough function that is
-    too few: a fraction of all points, the best ones, is searched from besides.
+    One starts from each point that has no better one within the critical distance, any other is linked to the nearest
+    better one (multi-level single linkage). On a rough function that is too few: a fraction starts besides.
 
     Args:
         shares: the points, evenly spread over the unit cube.
         costs: the function there; not finite where it fails.
-        fraction: from 0, none besides, to 1, all.
+        fraction: of all points, the best ones, from which searches start besides; 1 for all.
     """
     count, size = shares.shape
     stands = np.full(count, -1)

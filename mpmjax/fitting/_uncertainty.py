@@ -84,7 +84,8 @@ class Uncertainty(NamedTuple):
 
     def freedom(self, variance: np.ndarray, brought: list[np.ndarray]) -> np.ndarray:
         """The degrees of freedom of a variance, of which the noise of observations brought parts."""
-        return _ratio(variance**2, sum(v**2 / f for v, f in zip(brought, self.freedoms, strict=True)))
+        whole = np.where((variance > 0) & np.isfinite(variance), variance, 1)  # its square may overflow
+        return _ratio(1.0, sum((v / whole) ** 2 / f for v, f in zip(brought, self.freedoms, strict=True)))
 
 
 def quadratic(gradient: np.ndarray, matrix: np.ndarray) -> np.ndarray:

@@ -1,13 +1,15 @@
 """Runs, scenes and tables in files."""
 
 from mpmjax.io._frame_writer import FIELDS_WRITTEN as FIELDS_WRITTEN, check_fields as check_fields
-from mpmjax.io._json_schema import class_schemas as class_schemas, table_schema as table_schema
 from mpmjax.io._run_file import check_hdf5 as check_hdf5, check_place as check_place, standing_in as standing_in
 from mpmjax.io._runs import load as load, record as record, save as save, table as table
 from mpmjax.io._schema import (
+    MADE as MADE,
     arguments as arguments,
+    classes_for as classes_for,
     decode as decode,
     encode as encode,
+    forms_of as forms_of,
     known_classes as known_classes,
     parameters_of as parameters_of,
     register as register,

@@ -16,6 +16,7 @@ from mpmjax.analysis import FIELDS, fields_of
 from mpmjax.boundary import Impulses
 from mpmjax.checks import canonical, require
 from mpmjax.io._run_file import (
+    UNKNOWN,
     File,
     check_hdf5,
     check_place,
@@ -28,7 +29,6 @@ from mpmjax.io._run_file import (
     frame_rows,
     opened,
     reading,
-    require_of_file,
     rows_of,
     set_count,
     states_in,
@@ -90,7 +90,6 @@ class FrameWriter:
                 fields = [name for name in FIELDS if f"VTKHDF/PointData/{name}" in file]
                 described, rows = _first(run, initial_state(run), fields)
                 check_same(path, described, description_in(file["mpmjax"]))
-                require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
             file = opened(staged, path)
             count = count_in(file)
             if any(len(file[name]) != count * len(data) for name, data in rows.items()):
@@ -195,7 +194,7 @@ def _first(run: Problem, begin: RolloutState, fields: Sequence[str]) -> tuple[di
         leaves = list(map(np.asarray, jax.tree.leaves(eqx.filter(tree, eqx.is_array))))
         return f"{checksum({str(i): a for i, a in enumerate([*leaves, *(np.array(a.shape) for a in leaves)])}):08x}"
 
-    control = None if begin.particles.mass is None else "unknown"
+    control = None if begin.particles.mass is None else UNKNOWN
     if run.control is not None:
         name = getattr(run.control, "__qualname__", type(run.control).__qualname__)
         control = f"{name} {numbers(run.control)} with memory {numbers(run.memory)}"

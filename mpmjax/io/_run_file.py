@@ -1,15 +1,13 @@
-"""A run's HDF5 file: opened with checks that it is one, holds all of its data itself, and is whole; its frames, as
-ParaView reads them; and its description, all that is not frames.
+"""A run's HDF5 file (docs/notes/file_format.md): opened with checks that it is one, holds all of its data itself, and
+is whole; its frames, as ParaView reads them; and its description, all that is not frames.
 
-Frames are VTK's layout of moving particles in HDF5, temporal PolyData. They lie end to end in Points and PointData, and
-`Steps` says where each begins; the topology, a vertex a particle, is there once for all of them. Numbers keep the run's
-dtype. In one and two dimensions vectors are padded with zeros and deformation gradients with the identity; where a law
-knows J alone, J^(1/d) I stands for F. What laws remember is a dataset a name, NaN at the particles of others; fields
-that were asked for are there for plots. Every dataset is compressed and carries checksums, and a chunk holds one frame,
-so that writing a frame touches no other.
+Frames lie end to end in VTK's temporal PolyData, and `Steps` says where each begins; the topology is there once for all
+of them. Every dataset is compressed and carries checksums, and a chunk holds one frame, so that writing a frame touches
+no other.
 """
 
 import json
+import re
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
@@ -26,27 +24,20 @@ from mpmjax.checks import canonical, require
 from mpmjax.io._schema import decode, encode
 from mpmjax.io._transactional_file import StagedFile, reason, require_no_writer
 from mpmjax.simulation import Problem
-from mpmjax.state import Scene, State, by_material, history_arrays
+from mpmjax.state import Scene, State, history_arrays
 from mpmjax.stepping import AbstractIntegrator
 
 File = Any  # an `h5py.File`, whose own annotations do not say what a name leads to
 FORMAT = 9
 _LIBVER_HEAD, _LIBVER = ("v108", "v108"), ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
 _GROUPS = ("VTKHDF", "mpmjax")
-_GROWING = (
-    "VTKHDF/Points",
-    "VTKHDF/PointData/",
-    "VTKHDF/Steps/",
-    "mpmjax/frames",
-    "mpmjax/collider_impulse",
-    "mpmjax/boundary_impulse",
-    "mpmjax/memory/",
-    "mpmjax/checksums",
-)
+_GROWING = re.compile("VTKHDF/(Points|PointData/|Steps/)|mpmjax/(frames|collider_imp|boundary_imp|memory/|checksums)")
+_ATTRIBUTES = ("dtype", "d", "counts", "dt", "control")  # of a run's description
 # levels above 1 take up to 30 times as long for 3 to 5 % less: 55 and 63 % are saved of a jelly's and of a heap's run
 _STORED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 _MOST_SHRUNK = 1032  # the most that deflate shrinks data by
 _UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
+UNKNOWN = "unknown"  # the control of a run that had one and was saved, not recorded
 _UNCHANGING = ("mass", "volume", "X")
 _REMEDY = "restore it from a copy, or run the simulation again"
 
@@ -112,6 +103,7 @@ def reading(path: Path) -> Iterator[File]:
             _check(path, file)
             whole = _fixed_checksum(file) == file["mpmjax"].attrs["checksum"]
             require(whole, "its scene, method or particles are not what was written")
+            require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
             yield file
     except FileRefusedError:
         raise
@@ -156,20 +148,19 @@ def _check(path: Path, file: File) -> None:
         f"{file['mpmjax'].attrs['version'].decode()}, which wrote it.",
     )
     # a frame that was never written reads as zeros, has no checksum, and may be declared to be larger than any memory
-    count = count_in(file)
-    for growing, datasets in ((grows, _datasets(file, growing=grows)) for grows in (True, False)):
-        for name, item in datasets.items():
-            if not item.size:
-                continue
-            chunk: tuple[int, ...] = item.chunks or (0,)
-            rows, size = chunk[0], item.dtype.itemsize * int(np.prod(chunk))
-            require(rows and chunk[1:] == item.shape[1:], f"{name} does not lie in frames")
-            least = size // _MOST_SHRUNK if item.compression else size
-            stored: dict[int, int] = {}
-            item.id.chunk_iter(lambda chunk, stored=stored: stored.update({chunk.chunk_offset[0]: chunk.size}))
-            frames = range(count if growing else -(-len(item) // rows))
-            lost = next((n for n in frames if stored.get(n * rows, -1) < least), None)
-            require(lost is None, f"frame {lost} of {name} was never written")
+    growing = _datasets(file, growing=True)
+    for name, item in (growing | _datasets(file, growing=False)).items():
+        if not item.size:
+            continue
+        chunk: tuple[int, ...] = item.chunks or (0,)
+        rows, size = chunk[0], item.dtype.itemsize * int(np.prod(chunk))
+        require(rows and chunk[1:] == item.shape[1:], f"{name} does not lie in frames")
+        least = size // _MOST_SHRUNK if item.compression else size
+        stored: dict[int, int] = {}
+        item.id.chunk_iter(lambda chunk, stored=stored: stored.update({chunk.chunk_offset[0]: chunk.size}))
+        frames = range(count_in(file) if name in growing else -(-len(item) // rows))
+        lost = next((n for n in frames if stored.get(n * rows, -1) < least), None)
+        require(lost is None, f"frame {lost} of {name} was never written")
 
 
 def checksum(rows: dict[str, np.ndarray]) -> int:
@@ -183,7 +174,7 @@ def _datasets(file: File, *, growing: bool) -> dict[str, Any]:
     datasets: dict[str, Any] = {}
 
     def add(name: str, item: Any) -> None:
-        if not isinstance(item, Mapping) and name.startswith(_GROWING) == growing:
+        if not isinstance(item, Mapping) and bool(_GROWING.match(name)) == growing:
             datasets[name] = item
 
     file.visititems(add)
@@ -258,16 +249,10 @@ def created(staged: StagedFile, path: Path, described: dict[str, Any], rows: dic
     for name, data in rows.items():
         grow(file, name, data)
     group = file["mpmjax"]
-    texts = {"version": version("mpmjax"), "units": _UNITS, "dtype": described["dtype"]}
-    for name, text in (texts | {"materials": ", ".join(scene.titles)}).items():
-        group.attrs.create(name, np.bytes_(text.encode()))  # of fixed length: others lie where HDF5 has no checksum
-    group.attrs["format"] = np.int64(FORMAT)
-    group.attrs["d"] = np.int64(described["d"])
-    if described["control"] is not None:
-        group.attrs.create("control", np.bytes_(described["control"].encode()))
-    if described["counts"] is not None:
-        group.attrs["counts"] = np.asarray(described["counts"], np.int64)
-    group.attrs["dt"] = described["dt"]
+    words = {"version": version("mpmjax"), "units": _UNITS, "materials": ", ".join(scene.titles), "format": FORMAT}
+    for name, value in ({name: described[name] for name in _ATTRIBUTES} | words).items():
+        if value is not None:  # texts of fixed length: others lie where HDF5 has no checksum
+            group.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
     for name in ("scene", "method"):
         fix(group, name, np.frombuffer(json.dumps(described[name]).encode(), np.uint8))
     for name, data in described["particles"].items():
@@ -286,8 +271,8 @@ def rows_of(frame: int, time: float, state: State, fields: Mapping[str, Any]) ->
     p, d = x.shape
     flat = ((0, 0), (0, 3 - d))
     ratios, gradients = [], []
-    k = max((stored.shape[1] for _, stored, _ in by_material(state) if stored.ndim > 1), default=d)
-    for _, stored, _ in by_material(state):
+    k = max((stored.shape[1] for _, stored, _ in state.groups if stored.ndim > 1), default=d)
+    for _, stored, _ in state.groups:
         alone, a = stored.ndim == 1, np.asarray(stored)
         ratios.append(a if alone else np.linalg.det(a) if d > 1 else a[:, 0, 0])
         gradients.append(a[:, None, None] ** (1 / k) * np.eye(k, dtype=a.dtype) if alone else a)
@@ -334,7 +319,7 @@ def states_in(rows: dict[str, np.ndarray], like: State) -> State:
         taken("VTKHDF/Points", 3)[..., :d],
         taken("VTKHDF/PointData/velocity", 3)[..., :d],
         None if like.C is None else tensors("affine_velocity")[..., :d, :d],
-        tuple((J if a.ndim == 1 else F[..., : a.shape[1], : a.shape[1]])[:, of] for of, a, _ in by_material(like)),
+        tuple((J if a.ndim == 1 else F[..., : a.shape[1], : a.shape[1]])[:, of] for of, a, _ in like.groups),
         jax.tree.unflatten(jax.tree.structure(like.histories), history),
         *masses,
     )
@@ -369,12 +354,14 @@ def describe(run: Problem) -> dict[str, Any]:
 
 def description_in(group: File) -> dict[str, Any]:
     """The description of the run in a file (see `describe`)."""
+
+    def plain(value: Any) -> Any:
+        value = tuple(value.tolist()) if isinstance(value, np.ndarray) else value
+        return value.decode() if isinstance(value, bytes) else value
+
+    missing = {"counts", "control"} - group.attrs.keys()  # which a file may lack
     return {
-        "dtype": group.attrs["dtype"].decode(),
-        "d": int(group.attrs["d"]),
-        "counts": tuple(group.attrs["counts"].tolist()) if "counts" in group.attrs else None,
-        "dt": group.attrs["dt"],
-        "control": group.attrs["control"].decode() if "control" in group.attrs else None,
+        **{name: None if name in missing else plain(group.attrs[name]) for name in _ATTRIBUTES},
         **{name: json.loads(group[name][...].tobytes()) for name in ("scene", "method")},
         "arrays": {name: dataset[...] for name, dataset in group["arrays"].items()},
         "particles": {name: group[name][...] if name in group else None for name in _UNCHANGING},
@@ -388,10 +375,13 @@ def check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> None
         a, b = mine.get(name), other.get(name)
         show = "another array" if isinstance(b, np.ndarray) else "none" if b is None else repr(b)
         got = "" if isinstance(a, np.ndarray) else f" instead of {a!r}"
-        require_of_file(
-            type(a) is type(b) and np.array_equal(*cast(Any, (a, b))),
-            f"{path} holds another run: its {name} is {show}{got}. Resume the same run, or name a new file.",
-        )
+        advice = "Resume the same run, or name a new file."
+        if name == "control":
+            advice = "Resume a run with the control and the memory that it began with, or name a new file."
+            if b == UNKNOWN:
+                advice = "`save` does not know a run's control: go on by simulate, from what load returns, or record."
+        same = type(a) is type(b) and np.array_equal(*cast(Any, (a, b)))
+        require_of_file(same, f"{path} holds another run: its {name} is {show}{got}. {advice}")
 
 
 def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -408,5 +398,4 @@ def standing_in(path: Path) -> tuple[int, int]:
     does, and for a file that is being written."""
     require_no_writer(path)
     with reading(path) as file:
-        require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
         return count_in(file), int(file["mpmjax/frames"][count_in(file) - 1]["steps"])

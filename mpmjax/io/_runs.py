@@ -1,18 +1,10 @@
-"""Runs in files: HDF5 that ParaView opens as it is, and from which a run continues bit for bit.
-
-    /VTKHDF     the frames (see `_run_file`): Points, and as PointData velocity, deformation_gradient, J = det F,
-                with APIC affine_velocity, what laws that yield remember, and fields such as the pressure
-    /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
-                `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
-                up to it; `collider_impulse` and `boundary_impulse`, those on each by then, linear, then angular;
-                the `memory` of a control; `checksums`, CRC-32 of all that a frame adds, and the attribute `checksum`,
-                that of all other datasets
+"""Runs in files (docs/notes/file_format.md): HDF5 that ParaView opens as it is, and from which a run continues bit for
+bit.
 
 Whatever is not in a dataset lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps` is raised
 last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that the disk
-does not take leaves the file as it was (see `_transactional_file`).
-
-A file is read only if it holds all of its data itself: HDF5 follows links to other files, and would write into them.
+does not take leaves the file as it was (see `_transactional_file`). A file is read only if it holds all of its data
+itself: HDF5 follows links to other files, and would write into them.
 """
 
 import os
@@ -246,18 +238,16 @@ def load(path: str | os.PathLike, *, frame: int | None = None) -> Run:
     """
     path = Path(path)
     with reading(path) as file:
-        described = description_in(file["mpmjax"])
+        described: Any = description_in(file["mpmjax"])
         dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
         require(dtype.kind == "f", f"its numbers are of {dtype}")
         if dtype.itemsize > (most := jnp.zeros(()).dtype).itemsize:
             warn(f'{path} holds a {dtype} run, read in {most}: call jax.config.update("jax_enable_x64", True) before.')
             dtype = most
-        require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
-        count, which = count_in(file), frame
-        require_of_file(
-            which is None or -count <= which < count, f"{path} has {count} frames, there is no frame {which}."
-        )
-        start, stop = (0, count) if which is None else (which % count, which % count + 1)
+        count = count_in(file)
+        there = frame is None or -count <= frame < count
+        require_of_file(there, f"{path} has {count} frames, there is no frame {frame}.")
+        start, stop = (0, count) if frame is None else (frame % count, frame % count + 1)
         size = path.stat().st_size * (stop - start) / count
         require_memory(f"The run in {path}", size, "read one of its frames by load(path, frame=0).")
         scene = decode(described["scene"], Scene, "scene", arrays)
@@ -280,17 +270,7 @@ def load(path: str | os.PathLike, *, frame: int | None = None) -> Run:
         steps, frames, tallies = frames_in(file, like, start, stop)
         _check_numbers(scene, described["dt"], steps, frames.particles)
     last, statistics = at((frames, tallies), -1)
-    return run_to(
-        problem,
-        last,
-        steps[-1],
-        statistics,
-        steps=canonical(steps, dtype),
-        frames=frames.particles,
-        collider_impulse=frames.collider_impulse,
-        boundary_impulse=frames.boundary_impulse,
-        memory=frames.memory,
-    )
+    return run_to(problem, last, steps[-1], statistics, frames, steps=canonical(steps, dtype))
 
 
 @checked

@@ -46,16 +46,14 @@ def register(cls: Registered) -> Registered:
             limit: float | jax.Array
             ...
 
-    In a file such an object is a table whose `kind` is the class's name and whose other keys are its constructor's
-    arguments. So each argument must be a field of the same name, annotated with what files can hold: float, int, bool,
-    str, an array, an enumeration, an equinox module whose class is the package's, of `equinox.nn` or registered, a
-    function of `jax.nn` or a compiled one of `jax.numpy`, or tuples of such. So a law may hold a network,
-    `network: eqx.nn.MLP`; a run's file has its weights, a scene file cannot. Numbers in files are finite; a corner of a
-    box that may have no end is annotated as `mpmjax.geometry.Corner`.
+    In a file such an object is a table of its `kind`, the class's name, and its constructor's arguments. So each must
+    be a field of the same name, annotated with what files can hold: float, int, bool, str, an array, an enumeration, an
+    equinox module whose class is the package's, of `equinox.nn` or registered, a function of `jax.nn` or a compiled one
+    of `jax.numpy`, or tuples of such. So a law may hold a network, `network: eqx.nn.MLP`, whose weights only a run's
+    file has. Numbers in files are finite, but for those annotated as `mpmjax.geometry.Corner`.
 
-    A file names classes and never executes code: import the module that registers a class before reading a file with
-    one, in the shell by `mpmjax run SCENE.toml --import MODULE`. A class that is defined anew, as in a notebook, takes
-    the place of the one before.
+    A file never executes code: import the module that registers a class before reading a file with one, in the shell by
+    `mpmjax run SCENE.toml --import MODULE`. A class that is defined anew, as in a notebook, replaces the one before.
 
     Args:
         cls: an `equinox.Module`, such as a law, a boundary, a body force or a region; it is returned.

@@ -6,10 +6,9 @@ full disk refuses then is lost in silence. So it writes to memory, and a commit 
 the file first, since this is where room runs out, then what lies within it. If the disk refuses, it is made as it was.
 
 On Ctrl-C and SIGTERM a command of the shell ends at once, between two writes, and says where its files stand. Python's
-own way is an exception in the main thread, which waits until compiled code returns, and then comes anywhere: amid a
-trace, a callback of the compiler, a call of HDF5. So none is raised. A thread is told of the signal, waits for the
-write in progress, and ends the process with 128 + the signal's number. What is better ended in good order, such as a
-fit, asks for it by `stopping`.
+exception would wait until compiled code returns, and then come amid a trace or a call of HDF5. So a thread is told of
+the signal, waits for the write in progress, and ends the process with 128 + the signal's number. What is better ended
+in good order, such as a fit, asks for it by `stopping`.
 """
 
 import io
@@ -278,15 +277,10 @@ def require_no_writer(path: Path) -> None:
 
 
 def _lock(file: int, *, shared: bool) -> None:
-    """Lock an open file until it is closed.
+    """Lock an open file until it is closed; a BlockingIOError if another has it.
 
-    On Linux the lock is one of open file descriptions, which the locks that HDF5 takes in other programs do not meet,
-    so that ParaView can open a run that is being written. Elsewhere it is `flock`, and such a program may have to wait.
-    File systems that know no locks are written without one.
-
-    Raises:
-        BlockingIOError: another has it.
-    """
+    On Linux the lock is one of open file descriptions, which HDF5's in other programs do not meet: ParaView can open a
+    run that is being written. Elsewhere it is `flock`. File systems that know no locks are written without one."""
     if fcntl is None:
         return
     try:

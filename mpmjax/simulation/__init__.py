@@ -5,6 +5,7 @@ from mpmjax.simulation._diffrax import (
     Problem as Problem,
     RolloutState as RolloutState,
     initial_state as initial_state,
+    run_to as run_to,
 )
 from mpmjax.simulation._faults import (
     LARGEST_LINEARISATION_ERROR as LARGEST_LINEARISATION_ERROR,
@@ -21,7 +22,6 @@ from mpmjax.simulation._run import (
 from mpmjax.simulation._simulate import (
     number_of_steps as number_of_steps,
     rollout as rollout,
-    run_to as run_to,
     segment as segment,
     simulate as simulate,
 )

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial, reduce
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import diffrax
 import equinox as eqx
@@ -18,7 +18,7 @@ from mpmjax.autodiff import materialised, rematerialised
 from mpmjax.boundary import Impulses, no_impulses
 from mpmjax.checks import canonical, require, shortened
 from mpmjax.discretisation import Stencil, in_window
-from mpmjax.simulation._run import Fault, RunStatistics, no_steps, one_step
+from mpmjax.simulation._run import Fault, Run, RunStatistics, no_steps, one_step
 from mpmjax.simulation._sorting import MemoryOrder, resorted
 from mpmjax.state import Particles, Scene, State, state_of, with_dust, with_state
 from mpmjax.stepping import AbstractIntegrator, StepInfo, step_compiled
@@ -147,6 +147,30 @@ class Problem(eqx.Module):
         state, order = resorted(y.order, self.scene, self.particles, y.particles, t, step, self.save_every)
         scene, particles = order.put_into(self.scene, self.particles)
         return replace(self, scene=scene, particles=particles), replace(y, particles=state, order=order)
+
+
+def run_to(
+    problem: Problem, state: RolloutState, step: Any, statistics: RunStatistics, saved: Any = None, **more: Any
+) -> Run:
+    """The run that ended in this state at step `step`; its `saved` states have a leading axis, and `more` are the
+    fields that these do not have: their `steps`, what was `observed`."""
+    dtype, saved = problem.particles.x.dtype, RolloutState(cast(Any, None)) if saved is None else saved
+    return Run(
+        scene=problem.scene,
+        method=problem.method,
+        dt=problem.dt,
+        frames=saved.particles,
+        final=problem.at(state.particles),
+        final_step=jnp.asarray(step, dtype),
+        statistics=statistics,
+        collider_impulse=saved.collider_impulse,
+        final_collider_impulse=state.collider_impulse,
+        boundary_impulse=saved.boundary_impulse,
+        final_boundary_impulse=state.boundary_impulse,
+        memory=saved.memory,
+        final_memory=state.memory,
+        **({"steps": jax.device_put(np.zeros((0,), dtype)), "observed": None} | more),
+    )
 
 
 def _first_difference(asked: Any, new: Any) -> str:

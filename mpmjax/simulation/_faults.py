@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -14,9 +14,9 @@ from mpmjax._types import Array
 from mpmjax.autodiff import guard
 from mpmjax.checks import requirements, warn
 from mpmjax.material import AbstractLaw
-from mpmjax.simulation._diffrax import LEAST_STRETCH, Problem, RolloutState, faulty_particles, passed_particles
+from mpmjax.simulation._diffrax import LEAST_STRETCH, Problem, RolloutState, faulty_particles, passed_particles, run_to
 from mpmjax.simulation._run import Fault, Run, SimulationError
-from mpmjax.state import Particles, Scene, state_of, warn_of_crowding, with_state
+from mpmjax.state import Particles, Scene, state_of, warn_of_crowding
 from mpmjax.stepping import SAFETY, AbstractIntegrator, UnknownBoundError, longest_step
 
 
@@ -41,23 +41,15 @@ def raise_faults(run: Run, problem: Problem, before: Callable[[], RolloutState],
         if fault == Fault.INADMISSIBLE:
             law = run.scene.laws[int(np.searchsorted(np.cumsum(run.final.sizes), first, side="right"))]
             what, advice = disallowed(law, run.method)
-        last = with_state(run.final, previous.particles)
         reached = int((run.steps < step).sum())
-        names = ("steps", "frames", "observed", "collider_impulse", "boundary_impulse", "memory")
-        saved = {name: getattr(run, name) for name in names}
-        good = replace(
-            run,
-            **jax.tree.map(lambda a: a[:reached], saved),
-            final=last,
-            final_collider_impulse=previous.collider_impulse,
-            final_boundary_impulse=previous.boundary_impulse,
-            final_memory=previous.memory,
-            final_step=jnp.asarray(step - 1, run.final_step.dtype),
-        )
+        saved: Any = RolloutState(cast(Any, run.frames), run.collider_impulse, run.boundary_impulse, run.memory)
+        more = {"steps": run.steps, "observed": run.observed}
+        frames, more = jax.tree.map(lambda a: a[:reached], (saved, more))
+        good = run_to(problem, previous, step - 1, run.statistics, frames, **more)
         raise SimulationError(
             f"At step {step} (t = {step * float(run.dt):.6g} s) particle {first} {what}; the last good position was "
             f"{np.asarray(previous.particles.x[first])}. "
-            + advise(run.scene, run.method, run.dt, problem.particles, last, advice)
+            + advise(run.scene, run.method, run.dt, problem.particles, good.final, advice)
             + averaging_advice(run.scene),
             good,
         )

@@ -55,6 +55,7 @@ class RunStatistics(eqx.Module):
     """With BAD_PARAMETERS the number, from one, of the first of the `requirements` that is not met; else zero."""
 
     @property
+    @eqx.filter_jit
     def linearisation_error(self) -> Float[Array, "*f"]:
         """Error of the elastic force by the linearisation of implicit steps and by the return maps after them [-]: the
         largest of any step over the largest scale of any, so that quiet steps do not count."""

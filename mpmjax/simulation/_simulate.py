@@ -35,6 +35,7 @@ from mpmjax.simulation._diffrax import (
     faulty_particles,
     gravest,
     initial_state,
+    run_to,
 )
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
 from mpmjax.simulation._run import Fault, Run, RunStatistics
@@ -65,9 +66,9 @@ def simulate(
 ) -> Run:
     """Simulate a scene from step `start` to time t1 in steps of dt.
 
-    The rollout is differentiable with respect to every float of the scene, the particles and the method: in reverse
-    mode by default, within `checkpoint_bytes`; in forward mode (`jax.jvp`, `jax.jacfwd`) with
-    `adjoint=diffrax.ForwardMode()`. Only the number of steps, `save_every` and choices of code compile anew.
+    The rollout is differentiable by every float of scene, particles and method: in reverse mode by default, in forward
+    mode (`jax.jvp`, `jax.jacfwd`) with `adjoint=diffrax.ForwardMode()`. Only the number of steps, `save_every` and
+    choices of code compile anew.
 
     Args:
         scene: the scene.
@@ -77,11 +78,10 @@ def simulate(
             a whole number (`run.dt` says it). What stretches or stiffens on the way may need a shorter one.
         method: update of the grid velocity.
         save_every: save the state at the start, every so many steps, and at the end. Default: only `final` is returned.
-        observe: instead of states, save what this function of (scene, particles) returns, so that a curve costs no more
-            memory than its points. `save_every` then defaults to 1. It may be an `equinox.Module` with arrays; a plain
-            function compiles anew unless it is the same object.
-        start: number of the first step, e.g. a former run's `final_step`; time there is start·dt. The impulse on
-            colliders and boundaries (`run.collider_impulse`) is summed from here on in any run.
+        observe: instead of states, save what this function of (scene, particles) returns, by default at every step. An
+            `equinox.Module` may hold arrays; a plain function compiles anew unless it is the same object.
+        start: number of the first step, e.g. a former run's `final_step`; time there is start·dt. Impulses are summed
+            from here on.
         adjoint: how diffrax differentiates. Default: reverse mode by segments of steps.
         checkpoint_bytes: memory for what reverse mode stores by default [B]. With less of it steps are computed again,
             once if it is enough for the square root of their number.
@@ -89,21 +89,18 @@ def simulate(
         throw: raise on faults. False puts them into `statistics`, and a failed batch member leaves others alone.
         control: a pure function `(scene, particles, t, dt, memory) -> (scene, particles, memory)`, called before each
             step: the scene that it returns has other numbers in this step (accelerations, motions of boundaries), the
-            particles that it returns go on from there (activations, particles that enter or leave), and so does the
-            memory. Weights that are trained are arrays of an `equinox.Module`. See docs/control.md.
+            particles go on from there (activations, what enters or leaves), and so does the memory. Weights that are
+            trained are arrays of an `equinox.Module`. See docs/control.md.
         memory: the control's memory at the start, a pytree of floats; e.g. a former run's `final_memory`.
 
     Raises:
         ValueError: of `prepare`; a value of the method that it does not allow; a t1 not whole steps after the start.
-        SimulationError: a state that is not finite, a particle outside the window, an F that the law does not allow,
-            a particle that has collapsed (a stretch below a hundredth, in the updated description) or that passed a
-            boundary (each with step, time and first bad particle; the last good state is in its `run.final`, for which
-            the run is computed once more up to it), a solve that ended beyond ten times its tolerance; one that ended
+        SimulationError: a `Fault`, with step, time and first bad particle (its `run.final` is the last good state, for
+            which the run is computed once more), or a solve that ended beyond ten times its tolerance; one that ended
             nearer is a Python warning.
         RuntimeError: the same, and values that scene, particles or method do not allow, under an outer transformation
-            (`jax.jit`, `jax.grad`, `jax.vmap` and what is made of them, where only the derivative is asked for too);
-            and a tangent or adjoint solve that did not converge. Of compiled programs its text ends with the line that
-            says what is wrong. With `throw=False` such values make the state NaN and such a solve the derivative.
+            (`jax.jit`, `jax.grad`, `jax.vmap`); and a tangent or adjoint solve that did not converge. Of compiled
+            programs its last line says what is wrong. With `throw=False` the state or the derivative is NaN then.
     """
     start = require_whole("start", start, 0)
     dtype = particles.x.dtype
@@ -143,9 +140,8 @@ def simulate(
     problem = Problem(scene, particles, dt_, method, start=first, **held)
     go = partial(integrate, problem, begin, max_steps=count, adjoint=adjoint, progress=progress, watch=not traced)
     end = go(until=np.asarray(np.inf, dtype))
-    names = ("frames" if observe is None else "observed", "collider_impulse", "boundary_impulse", "memory")
-    saved = dict(zip(names, end.saved, strict=True)) | {"steps": end.steps, "report": end.report if traced else None}
-    run = run_to(problem, end.state, end.step, end.statistics, **saved)
+    saved = {"steps": end.steps, "observed": end.observed, "report": end.report if traced else None}
+    run = run_to(problem, end.state, end.step, end.statistics, end.frames, **saved)
     if not throw:
         return run
     if traced:
@@ -168,8 +164,8 @@ def rollout(
     control: Control | None = None,
     memory: Any = None,
 ) -> Particles:
-    """The plain rollout: `jax.lax.scan` over steps, without saving or checks. Tests compare `simulate` with it. Reverse
-    mode stores the state before each step and the solutions of implicit solves, and computes the rest again.
+    """The plain rollout: `jax.lax.scan` over steps, without saving or checks. Reverse mode stores the state before each
+    step and the solutions of implicit solves, and computes the rest again.
 
     Args:
         scene, particles, method, start, control, memory: as in `simulate`.
@@ -235,9 +231,8 @@ class End(NamedTuple):
     """The end of an integration."""
 
     steps: Float[Array, "f"]  # numbers of the saved frames; none if nothing was saved
-    saved: Any
-    """The frames, along a first axis: of each its state or what was observed, the impulses on colliders and on
-    boundaries, and the control's memory."""
+    frames: RolloutState | None  # them, along a first axis, without particles where something is observed instead
+    observed: Any  # likewise
     state: RolloutState
     step: Float[Array, ""]  # the number of the last step
     statistics: RunStatistics
@@ -257,11 +252,8 @@ def integrate(
     watch: bool = True,
 ) -> End:
     """Integrate `count` ≤ `max_steps` steps from a problem's start, at which the particles have this state. With
-    `watch` the run stops at a fault, and `until` so many steps.
-
-    Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it
-    compiles, and not a program of two thousand operations.
-    """
+    `watch` the run stops at a fault, and `until` so many steps. Without a count, all of them: what diffrax derives of
+    its last time is then a constant to XLA, and not a program of two thousand operations."""
     scene, particles, start, save_every = problem.scene, problem.particles, problem.start, problem.save_every
     dtype = particles.x.dtype
     zero, one, all_steps = (np.asarray(n, dtype) for n in (0, 1, max_steps))
@@ -282,8 +274,9 @@ def integrate(
 
     def frame(t: Any, y: RolloutState, args: Problem) -> Any:
         y = y.as_given()
-        value = y.particles if args.observe is None else args.observe(args.scene, args.at(y.particles))
-        return value, y.collider_impulse, y.boundary_impulse, y.memory
+        if args.observe is None:
+            return y, None
+        return replace(y, particles=cast(Any, None)), args.observe(args.scene, args.at(y.particles))
 
     subs = {"final": diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: y.as_given())}
     if save_every is not None:
@@ -304,10 +297,9 @@ def integrate(
     )
     times, values, (statistics, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
-    steps, saved = jnp.zeros((0,), dtype), (None,) * 4
-    if save_every is not None:
-        steps, saved = start + jnp.round(times["frames"]), values["frames"]
-    return End(steps, saved, final, start + statistics.steps.astype(dtype), statistics, report)
+    frames, observed = (None, None) if save_every is None else values["frames"]
+    steps = jnp.zeros((0,), dtype) if save_every is None else start + jnp.round(times["frames"])
+    return End(steps, frames, observed, final, start + statistics.steps.astype(dtype), statistics, report)
 
 
 def _before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
@@ -326,21 +318,3 @@ def segment(
     go = partial(integrate, replace(problem, start=first), begin, number, max_steps=max_steps)
     end = go(until=np.asarray(np.inf, first.dtype))
     return end.state, end.statistics, partial(_before_fault, go, begin, end.statistics)
-
-
-def run_to(problem: Problem, state: RolloutState, step: Any, statistics: RunStatistics, **saved: Any) -> Run:
-    """The run that ended in this state at step `step`; `saved` are its fields that hold more than its end."""
-    dtype = problem.particles.x.dtype
-    saved = {"steps": jax.device_put(np.zeros((0,), dtype)), "frames": None, "observed": None} | saved
-    return Run(
-        scene=problem.scene,
-        method=problem.method,
-        dt=problem.dt,
-        final=problem.at(state.particles),
-        final_step=jnp.asarray(step, dtype),
-        statistics=statistics,
-        final_collider_impulse=state.collider_impulse,
-        final_boundary_impulse=state.boundary_impulse,
-        final_memory=state.memory,
-        **saved,
-    )

@@ -18,7 +18,7 @@ from mpmjax._types import Array, Bool, Float, Int, ParticleVector, Scalar, compo
 from mpmjax.autodiff import custom_derivative
 from mpmjax.discretisation import BSpline, Grid, basis_of, first_nodes
 from mpmjax.native import backend
-from mpmjax.state import AttachedPoints, Particles, Scene, State, by_material, is_foreign
+from mpmjax.state import AttachedPoints, Particles, Scene, State, is_foreign
 
 Order = Int[Array, "p"]  # the number of the particle that comes first, second, ..
 VARIABLE = "MPMJAX_ORDER"
@@ -63,10 +63,9 @@ def memory_order(scene: Scene, particles: Particles, steps: int) -> MemoryOrder 
     """The order in which prepared particles were given, which `resorted` will change; None if they stay in it.
 
     Particles are sorted in the updated description, with native sums, if a law yields or flows: bodies that only deform
-    keep their order. A body force may know particles by their numbers, so with one they stay as they are. With the
-    environment variable MPMJAX_ORDER=given they always do, and with another value a ValueError is raised; it is read
-    when a program is compiled. `steps` are those of the run, or between two saved frames.
-    """
+    keep their order. So does a scene with a body force, which may know particles by their numbers, and all with the
+    environment variable MPMJAX_ORDER=given, read when a program is compiled. `steps` are those of the run, or between
+    two saved frames."""
     asked = os.environ.get(VARIABLE, "")
     if asked not in ("", "given"):
         raise ValueError(f"{VARIABLE} must be given, or not be set, got {asked!r}.")
@@ -106,10 +105,10 @@ def resorted(
         cells = cells_of(scene.kernel, scene.grid, scene.window(original), scene.on_grid(original, t))
         numbers = []
         for group in particles.groups:  # by cell if many are far from their neighbours
-            part = cells[slice(*group.rows)]
+            part = cells[group.rows]
             mixed = (jnp.abs(part[1:] - part[:-1]) > 1).mean() > MIXED
             by_number = jnp.arange(part.size, dtype=part.dtype)
-            numbers.append(group.rows[0] + jnp.where(mixed, by_cell(part), by_number))
+            numbers.append(group.rows.start + jnp.where(mixed, by_cell(part), by_number))
         number = jnp.concatenate(numbers)
         new = _places(number)
         return place[number], tuple(new[_whole(rows)].astype(rows.dtype) for rows in _attached(scene))
@@ -119,7 +118,7 @@ def resorted(
 
     # of the members of a batch, which may end at different times, all take the branch that any of them needs
     whole, attached = jax.lax.cond(unvmap_any(due), by_cells, same)
-    groups = zip(by_material(state), order.parameters, strict=True)
+    groups = zip(state.groups, order.parameters, strict=True)
     parameters = (_moved(due, whole[rows] - rows.start, values) for (rows, *_), values in groups)
     changed = MemoryOrder(rearranged(due, whole, order.numbers.T).T, tuple(parameters), attached)
     return _in_order(due, whole, state), changed
@@ -127,7 +126,7 @@ def resorted(
 
 def _in_order(wanted: Bool[Array, ""], order: Order, state: State) -> State:
     """A state with the particles of each material in another order, where that is wanted."""
-    groups = [_moved(wanted, order[rows] - rows.start, (F, history)) for rows, F, history in by_material(state)]
+    groups = [_moved(wanted, order[rows] - rows.start, (F, history)) for rows, F, history in state.groups]
     deformations, histories = zip(*groups, strict=True)
     x, v, C = _moved(wanted, order, (state.x, state.v, state.C))
     return State(x, v, C, deformations, histories)

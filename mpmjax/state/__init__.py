@@ -30,7 +30,6 @@ from mpmjax.state._material_points import (
 from mpmjax.state._particles import (
     Particles as Particles,
     State as State,
-    by_material as by_material,
     history_arrays as history_arrays,
     join as join,
     state_of as state_of,

@@ -2,6 +2,7 @@
 step: how the nodes move them, and how forces on them reach the nodes."""
 
 import abc
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -90,9 +91,8 @@ class AttachedPoints(AbstractPlace):
         if self.area is None:
             return self
         rows, groups = np.atleast_2d(np.asarray(self.particle))[0].astype(int), particles.groups
-        hoop = np.concatenate(
-            [np.ones(q.rows[1] - q.rows[0]) if q.stored is None else q.stored[:, 2, 2] for q in groups]
-        )
+        sizes = zip(groups, particles.sizes, strict=True)
+        hoop = np.concatenate([np.ones(n) if q.stored is None else q.stored[:, 2, 2] for q, n in sizes])
         length = 2 * np.pi * np.asarray(self.place)[:, 0] / hoop[rows]
         return eqx.tree_at(lambda p: (p.weight, p.area), self, (self.weight * length, self.area * length[:, None]))
 
@@ -320,9 +320,7 @@ class LoadedPoints(eqx.Module):
         F = self.deformation
         if F is not None and self.rate is not None:
             F = F + time * self.rate
-        return eqx.tree_at(
-            lambda p: (p.x, p.deformation), self, (self.x + time * self.v, F), is_leaf=lambda leaf: leaf is None
-        )
+        return replace(self, x=self.x + time * self.v, deformation=F)
 
     def displacement(self, moved: Displacement) -> Float[Array, "d s"]:
         """Σ_i N_is u_i, of a displacement or velocity of the nodes."""

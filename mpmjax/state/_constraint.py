@@ -57,14 +57,8 @@ class AbstractConstraint(eqx.Module):
         self, scene: Any, particles: Particles, nodes: AbstractNodes, planes: Mirror
     ) -> tuple[AbstractLayerImage, NodeVector, Mask, NodeVector]:
         """The map of the body's nodes in a step; and of its layer the velocity at the start [m/s], the components that
-        are held, and their velocity, each (m, d): at the nodes of q, and zero or False elsewhere.
-
-        Args:
-            scene: the scene.
-            particles: all prepared particles.
-            nodes: all nodes, with what boundaries prescribe, not folded yet.
-            planes: the mirrors of symmetry planes.
-        """
+        are held, and their velocity, each (m, d): at the nodes of q, and zero or False elsewhere. All particles are
+        prepared, all nodes have what boundaries prescribe, not folded yet, and `planes` are those of symmetry."""
 
     @abc.abstractmethod
     def moved(
@@ -90,17 +84,11 @@ class AbstractConstraint(eqx.Module):
         tied: tuple[Array, NodeVector],
         guide: int | None,
     ) -> tuple[Int[Array, "n d"], OwnedCouple]:
-        """Which boundary holds each component of the nodes' velocity once a node that is held holds the body; and the
-        couple that the body receives besides the forces on its nodes.
-
-        Args:
-            image: its map.
-            owners: the boundary that holds each component, −1 for none.
-            planes: the mirrors of symmetry planes, with their boundaries' numbers.
-            loose: masses of all nodes [kg], shape (n,), and their change of velocity in the solve [m/s], shape (n, d).
-            tied: likewise of the folded nodes.
-            guide: the number under which its own hold is reported; None without any.
-        """
+        """Which boundary holds each component of the nodes' velocity (`owners` without the body, −1 for none) once a
+        node that is held holds the body; and the couple that the body receives besides the forces on its nodes.
+        `planes` are the mirrors of symmetry planes with their boundaries' numbers, `loose` masses of all nodes [kg],
+        (n,), and their change of velocity in the solve [m/s], (n, d), `tied` likewise of the folded nodes, and `guide`
+        is the number under which its own hold is reported, if it has one."""
 
     @abc.abstractmethod
     def kinetic_energy(self, x: ParticleVector, v: ParticleVector, mass: Array, volume: Array) -> Float[Array, ""]:

@@ -118,7 +118,8 @@ class Particles(eqx.Module):
     def groups(self) -> tuple["Group", ...]:
         """The particles of each material."""
         ends = pairwise(accumulate(self.sizes, initial=0))
-        return tuple(Group(*group) for group in zip(ends, self.deformations, self.histories, strict=True))
+        each = zip(ends, self.deformations, self.histories, strict=True)
+        return tuple(Group(slice(*rows), stored, history) for rows, stored, history in each)
 
 
 def _only(each: tuple, name: str, field: str) -> Any:
@@ -132,8 +133,8 @@ def _only(each: tuple, name: str, field: str) -> Any:
 class Group(NamedTuple):
     """The particles of one material."""
 
-    rows: tuple[int, int]  # first particle, and the one after the last
-    stored: Float[Array, "q ..."] | None  # their entry of `Particles.deformations`
+    rows: slice  # from the first particle to the one after the last
+    stored: Any  # their entry of `Particles.deformations`
     history: Any  # leaves of shape (q,)
 
     def deformation(self) -> Deformation:
@@ -202,9 +203,9 @@ def join(*sets: Particles, material: int | None = None) -> Particles:
     arrays: dict[str, Any] = {}
     for name in ("x", "v", "mass", "volume", "C", "X"):
         if getattr(sets[0], name) is not None:
-            each = [xp.asarray(getattr(q, name))[slice(*group.rows)] for members in materials for q, group in members]
+            each = [xp.asarray(getattr(q, name))[group.rows] for members in materials for q, group in members]
             arrays[name] = jax.device_put(xp.concatenate(each))
-    counts = tuple(sum(group.rows[1] - group.rows[0] for _, group in members) for members in materials)
+    counts = tuple(sum(group.rows.stop - group.rows.start for _, group in members) for members in materials)
     return Particles(
         **arrays,
         deformations=tuple(of_one_material([group.stored for _, group in members]) for members in materials),
@@ -235,23 +236,20 @@ class State(eqx.Module):
     mass: Float[Array, "*f p"] | None = None  # masses [kg], shape (p,); None where no control may change them
     volume: Float[Array, "*f p"] | None = None  # undeformed volumes [m^d], likewise
 
-    F, history = Particles.F, Particles.history
+    F, history, groups = Particles.F, Particles.history, Particles.groups
 
-
-def by_material(held: Particles | State) -> list[tuple[slice, Any, Any]]:
-    """Rows, deformation and history of each material, of prepared particles or of a state of them."""
-    deformations: tuple[Any, ...] = held.deformations
-    ends = pairwise(accumulate(map(len, deformations), initial=0))
-    groups = zip(ends, deformations, held.histories, strict=True)
-    return [(slice(*rows), deformation, history) for rows, deformation, history in groups]
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of particles of each material."""
+        return tuple(len(F) for F in self.deformations if F is not None)
 
 
 def history_arrays(held: Particles | State) -> list[tuple[str, slice, Any]]:
     """Name, rows and values of each array of the laws' histories, in the order of the leaves of `histories`."""
     return [
-        (path[-1].name, rows, leaf)
-        for rows, _, history in by_material(held)
-        for path, leaf in jax.tree_util.tree_leaves_with_path(history)
+        (path[-1].name, group.rows, leaf)
+        for group in held.groups
+        for path, leaf in jax.tree_util.tree_leaves_with_path(group.history)
     ]
 
 
@@ -269,7 +267,7 @@ def with_dust(particles: Particles) -> Particles:
     def some(a: ParticleScalar) -> ParticleScalar:
         most = jax.lax.stop_gradient(a.max())
         most = jnp.where(most > 0, most, 1)
-        return jnp.concatenate([dusted(a[slice(*group.rows)], most) for group in particles.groups])
+        return jnp.concatenate([dusted(a[group.rows], most) for group in particles.groups])
 
     return eqx.tree_at(lambda q: (q.mass, q.volume), particles, (some(particles.mass), some(particles.volume)))
 

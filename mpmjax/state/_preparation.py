@@ -135,10 +135,10 @@ def _check_loads(scene: Scene, particles: Particles) -> None:
             f"The {name} is attached to particle {rows.max():.0f}, but there are {particles.count}: attach it to these "
             "particles.",
         )
-        ends = np.cumsum([0, *particles.sizes])
-        for law, start, stop in zip(scene.laws, ends[:-1], ends[1:], strict=True):
+        for law, group in zip(scene.laws, particles.groups, strict=True):
+            there = (rows >= group.rows.start) & (rows < group.rows.stop)
             require(
-                not load.needs_deformation() or keeps_deformation(law) or not ((rows >= start) & (rows < stop)).any(),
+                not load.needs_deformation() or keeps_deformation(law) or not there.any(),
                 f"A following {name} needs the whole deformation gradient, which {law.title()} does not keep: take "
                 "following=False, or a Traction.",
             )
@@ -147,18 +147,18 @@ def _check_loads(scene: Scene, particles: Particles) -> None:
 def _prepared(law: AbstractLaw, group: Group, dtype: Any, dim: int, xp: Any) -> tuple[Array, Any]:
     """Deformation, with so many rows, and history of one material's particles, of which `xp`, NumPy or JAX, makes what
     is missing."""
-    start, stop = group.rows
+    count = group.rows.stop - group.rows.start
     leaves = jax.tree.leaves(law, is_leaf=is_foreign)  # the numbers of networks and the like are their own
-    shapes, fitting = {jnp.shape(a) for a in leaves if eqx.is_array_like(a)}, {(), (1,), (stop - start,)}
+    shapes, fitting = {jnp.shape(a) for a in leaves if eqx.is_array_like(a)}, {(), (1,), (count,)}
     require(
         shapes <= fitting,
-        f"{law.title()}'s parameters must be one number or one for each of its {stop - start} particles, got shapes "
+        f"{law.title()}'s parameters must be one number or one for each of its {count} particles, got shapes "
         f"{sorted(shapes - fitting)}. What has another shape, as a network's weights, belongs in an equinox.Module "
         "within the law.",
     )
     kept = law.measure
     undeformed = kept.undeformed(dim)
-    shape, stored = (stop - start, *undeformed.shape), group.stored
+    shape, stored = (count, *undeformed.shape), group.stored
     if stored is None:
         stored = jax.device_put(xp.broadcast_to(undeformed.astype(dtype), shape))
     require(stored.shape == shape, f"{law.title()} needs {kept.symbol} of shape {shape}, got {stored.shape}.")
@@ -233,10 +233,10 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
         )
     for constraint in scene.constraints:
-        rows = slice(*particles.groups[constraint.number].rows)
+        rows = particles.groups[constraint.number].rows
         constraint.check_particles(np.asarray(particles.x[rows], float), float(scene.grid.spacing))
     for law, group, allowed in zip(scene.laws, particles.groups, admissible, strict=True):
-        kept, first = law.measure, int(np.argmin(allowed)) + group.rows[0]
+        kept, first = law.measure, int(np.argmin(allowed)) + group.rows.start
         require(
             allowed,
             f"{type(law).__name__} does not allow the {kept.symbol} of particle {first} (most laws need "

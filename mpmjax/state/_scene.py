@@ -283,8 +283,8 @@ class Scene(eqx.Module):
         """The materials of prepared particles at time t [s], with the elastic laws in force."""
         materials = ()
         for law, q in zip(self.laws, particles.groups, strict=True):
-            volume, elastic = particles.volume[slice(*q.rows)], law.elastic(q.history)
-            materials += (MaterialPoints(elastic, volume, q.deformation(), self.total, q.rows, law.viscosity),)
+            volume, elastic, rows = particles.volume[q.rows], law.elastic(q.history), (q.rows.start, q.rows.stop)
+            materials += (MaterialPoints(elastic, volume, q.deformation(), self.total, rows, law.viscosity),)
         if (averaged := self.volume) is None:
             return materials
         grid, window, positions = self.grid.with_layers(1), self.window(particles), self.on_grid(particles, t)

@@ -42,7 +42,8 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
         return
     x, volume = (np.asarray(a)[there] for a in (particles.x, particles.volume))
     resting = tuple(c.rests(total=total) and not grid.follow for c in boundary)
-    inputs = boundary, grid, jnp.asarray(x), jnp.asarray(volume), resting, total
+    places = jnp.asarray(x, x.dtype)  # without a dtype JAX compiles a program
+    inputs = boundary, grid, places, jnp.asarray(volume, x.dtype), resting, total
     some = jax.tree.leaves(eqx.filter_eval_shape(_probe, *inputs))  # none, and no compiling, of walls
     within, touched = eqx.filter_jit(_probe)(*inputs) if some else ([None] * len(boundary),) * 2
     first = (np.asarray(grid.origin) - 1) * dx
@@ -62,7 +63,7 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
         if mask is not None:
             may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
             if not may_meet:  # only the nodes in a particle's stencil
-                first_nodes = np.asarray(_base(scene.kernel, grid, jnp.asarray(x)))
+                first_nodes = np.asarray(_base(scene.kernel, grid, places))
                 reached = np.zeros(grid.shape, dtype=bool)
                 for offset in itertools.product(range(scene.kernel.order + 1), repeat=d):
                     reached[tuple(((first_nodes + offset) % grid.shape).T)] = True
@@ -87,7 +88,7 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
         )
     side = volume ** (1 / d)
     for number, group in enumerate(particles.groups, 1):
-        rows = slice(*np.searchsorted(there, group.rows))
+        rows = slice(*np.searchsorted(there, (group.rows.start, group.rows.stop)))
         if rows.start == rows.stop:
             continue
         half = side[rows, None] / 2

@@ -52,9 +52,9 @@ class AbstractProblem(eqx.Module):
         """x(X, t) [m] of one point X [m], shape (d,)."""
 
     @property
-    @abc.abstractmethod
     def duration(self) -> float:
-        """Duration of the run [s]."""
+        """Duration of the run [s]. Default: 2/c, one period of waves of the bar's speed in a metre."""
+        return 2 / float(self.bar_speed)
 
     @abc.abstractmethod
     def box(self) -> tuple[tuple[float, ...], tuple[float, ...], Ends]:

@@ -26,25 +26,13 @@ class AxisAligned(AbstractProblem):
     R. M. Kirby, M. Berzins, Comput. Model. Eng. Sci. 31 (2008) 107).
 
     φ = (0, π) in 2-D, (0, 2π/3, 4π/3) in 3-D. The motion is odd at the faces, so it is periodic over [−1, 1]^d.
-
-    Args:
-        amplitude: A [m], below 1/π. 0.05 deforms by up to 16 per cent.
-        dim: space dimension.
-        ends: boundary at the faces.
-        material: any law; its Young's modulus sets c.
-        density: ρ0 [kg/m^d].
     """
 
-    amplitude: float = 0.05
-    dim: int = eqx.field(static=True, default=2)
-    ends: Ends = eqx.field(static=True, default=Ends.PERIODIC)
-    material: AbstractMaterial = NeoHookean(1e7, 0.3)
-    density: float = 1e3
-
-    @property
-    def duration(self) -> float:
-        """One period, 2/c [s]."""
-        return 2 / float(self.bar_speed)
+    amplitude: float = 0.05  # A [m], below 1/π; 0.05 deforms by up to 16 per cent
+    dim: int = eqx.field(static=True, default=2)  # space dimension
+    ends: Ends = eqx.field(static=True, default=Ends.PERIODIC)  # boundary at the faces
+    material: AbstractMaterial = NeoHookean(1e7, 0.3)  # any law; its Young's modulus sets c
+    density: float = 1e3  # ρ0 [kg/m^d]
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         phase = jnp.pi * jnp.asarray(_PHASES[self.dim], X.dtype)
@@ -60,19 +48,13 @@ class AxisAligned(AbstractProblem):
 class VibratingBar(AbstractProblem):
     """v = v0 cos(ωt) sin(βX), β = (2n − 1)π/2L, ω = β√(E/ρ0), on 0 ≤ X ≤ L.
 
-    Exact at any amplitude in one dimension with ν = 0, where P = E (F − 1) is linear. The free end needs no
-    condition.
-
-    Args:
-        speed: v0 [m/s].
-        mode: n, from 1.
-        length: length L of the bar [m].
+    Exact at any amplitude in one dimension with ν = 0, where P = E (F − 1) is linear. The free end needs no condition.
     """
 
     forced: ClassVar[bool] = False
-    speed: float = 0.1
-    mode: int = eqx.field(static=True, default=1)
-    length: float = eqx.field(static=True, default=25.0)
+    speed: float = 0.1  # v0 [m/s]
+    mode: int = eqx.field(static=True, default=1)  # n, from 1
+    length: float = eqx.field(static=True, default=25.0)  # length L of the bar [m]
     material: AbstractMaterial = FixedCorotated(100.0, 0.0)  # the law, with ν = 0
     density: float = 1.0  # ρ0 [kg/m^d]
     dim: int = eqx.field(static=True, default=1)  # space dimension
@@ -111,26 +93,14 @@ class ExpandingRing(AbstractProblem):
 
     The displacement of the inner edge is A sin(πct). U′ vanishes at both edges, so that with ν = 0 they are free of
     traction at every amplitude. The grid has no part in the shape.
-
-    Args:
-        amplitude: A [m], below Ri.
-        inner: Ri [m].
-        outer: Ro [m].
-        material: a law with ν = 0, of which the radial stress vanishes at a radial stretch of one.
-        density: ρ0 [kg/m²].
     """
 
-    amplitude: float = 0.1
-    inner: float = 0.4
-    outer: float = 0.6
-    material: AbstractMaterial = NeoHookean(1e7, 0.0)
-    density: float = 1e3
+    amplitude: float = 0.1  # A [m], below Ri
+    inner: float = 0.4  # Ri [m]
+    outer: float = 0.6  # Ro [m]
+    material: AbstractMaterial = NeoHookean(1e7, 0.0)  # ν = 0, its radial stress zero at a radial stretch of one
+    density: float = 1e3  # ρ0 [kg/m²]
     dim: int = eqx.field(static=True, default=2)  # space dimension
-
-    @property
-    def duration(self) -> float:
-        """One period, 2/c [s]."""
-        return 2 / float(self.bar_speed)
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         a, b = self.inner, self.outer
@@ -165,16 +135,11 @@ class Vortex(AbstractProblem):
     A. Sadeghirad, J. Guilkey, Eng. Comput. 31 (2015) 201, doi 10.1007/s00366-013-0342-x).
 
     The volume does not change, and the edges of the ring are at rest.
-
-    Args:
-        amplitude: A [rad]. The shear of F reaches 7 A in the ring.
-        material: any law.
-        density: ρ0 [kg/m²].
     """
 
-    amplitude: float = 0.1
-    material: AbstractMaterial = NeoHookean(1e3, 0.3)
-    density: float = 1e3
+    amplitude: float = 0.1  # A [rad]; the shear of F reaches 7 A in the ring
+    material: AbstractMaterial = NeoHookean(1e3, 0.3)  # any law
+    density: float = 1e3  # ρ0 [kg/m²]
     dim: int = eqx.field(static=True, default=2)  # space dimension
 
     @property
@@ -206,17 +171,12 @@ class StandingWave(AbstractProblem):
 
     Exact at every amplitude with F₁₁ > 0: under uniaxial strain fixed corotated elasticity has
     P₁₁ = (λ + 2μ)(F₁₁ − 1), and no coupling to other directions. In these the body is periodic over four cells.
-
-    Args:
-        amplitude: A [m], below 1/π.
-        dim: space dimension.
-        ends: boundary at X₁ = 0 and 1.
     """
 
     forced: ClassVar[bool] = False
-    amplitude: float = 0.05
-    dim: int = eqx.field(static=True, default=1)
-    ends: Ends = eqx.field(static=True, default=Ends.MIRRORED)
+    amplitude: float = 0.05  # A [m], below 1/π
+    dim: int = eqx.field(static=True, default=1)  # space dimension
+    ends: Ends = eqx.field(static=True, default=Ends.MIRRORED)  # boundary at X₁ = 0 and 1
     material: AbstractMaterial = FixedCorotated(1e4, 0.3)  # the law, fixed corotated
     density: float = 1e3  # ρ0 [kg/m^d]
 
@@ -259,16 +219,11 @@ class BentBar(eqx.Module):
 
     With ν = 0 and a small curvature κ, u = κ (−X Y, X²/2), with the stress −E κ Y along it: the face that is held is
     the plane X = 0, without any stress that singles out its corners.
-
-    Args:
-        length: L [m].
-        curvature: κ [1/m], so small that squares do not matter.
-        material: a law with ν = 0.
     """
 
-    length: float = 2.0
-    curvature: float = 1e-5
-    material: AbstractMaterial = FixedCorotated(1e5, 0.0)
+    length: float = 2.0  # L [m]
+    curvature: float = 1e-5  # κ [1/m], so small that squares do not matter
+    material: AbstractMaterial = FixedCorotated(1e5, 0.0)  # a law with ν = 0
 
     def errors(self, cells: int, held: AbstractBoundary, **choices: Any) -> tuple[float, float]:
         """The relative errors of the displacement (RMS) and of the stress along the bar (mean, over the largest), with
@@ -295,20 +250,13 @@ class TwoDisks(eqx.Module):
 
     No exact motion is known. The momentum is zero at all times, the disks touch at t = (‖Δcentre‖ − 2R)/‖Δv‖, and the
     energy never grows.
-
-    Args:
-        radius: radius R [m].
-        centre: the centres of the disks are ±(centre, centre) [m].
-        speed: their initial velocities are ∓(speed, speed) [m/s].
-        density: ρ0 [kg/m²].
-        material: the law of both.
     """
 
-    radius: float = 0.2
-    centre: float = 0.3
-    speed: float = 0.1
-    density: float = 1e3
-    material: AbstractMaterial = NeoHookean(1e3, 0.3)
+    radius: float = 0.2  # R [m]
+    centre: float = 0.3  # the centres of the disks are ±(centre, centre) [m]
+    speed: float = 0.1  # their initial velocities are ∓(speed, speed) [m/s]
+    density: float = 1e3  # ρ0 [kg/m²]
+    material: AbstractMaterial = NeoHookean(1e3, 0.3)  # the law of both
 
     @property
     def contact_time(self) -> float:

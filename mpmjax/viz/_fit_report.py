@@ -130,8 +130,10 @@ def write_fit(
         }
     else:
         numbers = _numbers(result, measured, profiles, predictions)
+    text = json.dumps(numbers, default=lambda array: array.tolist())
+    plain = json.loads(text, parse_constant=lambda not_finite: None)
     with replacing(path) as aside:
-        aside.write_text(json.dumps(_plain(numbers), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        aside.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return path
 
 
@@ -143,14 +145,15 @@ def _numbers(
 ) -> dict[str, Any]:
     observations = [o for e in measured or result.experiments for o in e.observations]
     predictions = predict_observations(result, measured or None) if predictions is None else predictions
-    plain = ("correlation", "chi_squared", "p_value", "degrees_of_freedom", "level", "converged", "interrupted")
+    plain = ("chi_squared", "p_value", "degrees_of_freedom", "level", "converged", "interrupted")
     bands = ("value", "error", "lower", "upper", "sigma", "new_lower", "new_upper")
     of_profile = ("label", "interval", "threshold", "degrees_of_freedom", "level", "warnings")
     return {
         "estimates": [e._asdict() for e in result.all],
-        "fisher_spectrum": result.spectrum,
-        "covariance_of_coordinates": result.covariance,
-        "fisher_directions": result.directions,
+        "correlation": result.uncertainty.correlation,
+        "fisher_spectrum": result.uncertainty.spectrum,
+        "covariance_of_coordinates": result.uncertainty.covariance,
+        "fisher_directions": result.uncertainty.directions,
         **{name: getattr(result, name) for name in plain},
         "noise": [n._asdict() for n in result.noise],
         "predictions": [
@@ -167,20 +170,3 @@ def _numbers(
         "iterations": [i._asdict() for i in result.history],
         "warnings": result.warnings,
     }
-
-
-def _plain(value: object) -> object:
-    """A value as JSON has it: arrays as lists, numbers that are not finite as null."""
-    match value:
-        case dict():
-            return {key: _plain(v) for key, v in value.items()}
-        case list() | tuple() | np.ndarray():
-            return [_plain(v) for v in value]
-        case bool() | np.bool_():
-            return bool(value)
-        case float() | np.floating():
-            return float(value) if np.isfinite(value) else None
-        case np.integer():
-            return int(value)
-        case _:
-            return value

@@ -13,8 +13,8 @@ from mpmjax.analysis import FIELDS, smoothed, volume_ratio
 from mpmjax.checks import between, canonical, checked, require, require_between, require_memory
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
-from mpmjax.state import Particles, Scene, by_material, history_arrays
-from mpmjax.viz._pixels import disks, film_pictures, write_film
+from mpmjax.state import Particles, Scene, history_arrays
+from mpmjax.viz._film import film_pictures, write_film
 
 COLOURS: dict[str, tuple[str, Callable[[Scene, Particles], Any]]] = {
     **{name: field for name, field in FIELDS.items() if name != "stress"},
@@ -170,8 +170,8 @@ def _legend(axes: Any, scene: Scene) -> None:
 def _tinted(particles: Particles, bar: Any, values: np.ndarray) -> np.ndarray:
     """The particles' colours, (p, 3): by their values, and where there are none by their material."""
     colours = np.empty((particles.count, 3))
-    for i, (rows, *_) in enumerate(by_material(particles)):
-        colours[rows] = _colour_of(i, particles.dim)
+    for i, group in enumerate(particles.groups):
+        colours[group.rows] = _colour_of(i, particles.dim)
     if bar is None:
         return colours
     return np.where(np.isnan(values)[:, None], colours, bar.to_rgba(values)[:, :3])
@@ -268,18 +268,18 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
         box = tick.label1.get_window_extent()
         tick.label1.set_visible(not any(box.overlaps(other) for other in taken))
         taken += [box] * tick.label1.get_visible()
-    over: Any = figure.add_axes((0, 0, 1, 1), zorder=4)  # the particles' pixels
+    over: Any = figure.add_axes((0, 0, 1, 1), xlim=(0, 1), ylim=(0, 1), zorder=4)
     over.axis("off")
+    balls = over.scatter([], [], linewidths=0, rasterized=True)  # and their shadows
 
     def on_paper(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The pixels of points, counted from the upper left, (n, 2), and how far they are."""
+        """The pixels of points, (n, 2), and how far they are."""
         across, along, depth = proj3d.proj_transform(x[:, 0], x[:, 1], x[:, 2], axes.get_proj())
-        pixels = axes.transData.transform(np.stack([across, along], axis=1))
-        return np.stack([pixels[:, 0], figure.bbox.height - pixels[:, 1]], axis=1), np.asarray(depth)
+        return axes.transData.transform(np.stack([across, along], axis=1)), np.asarray(depth)
 
     if bar is not None:  # as high as the box of the axes is on paper
         corners = np.stack(np.meshgrid(*np.stack([lower, upper], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
-        heights = 1 - on_paper(corners)[0][:, 1] / figure.bbox.height
+        heights = on_paper(corners)[0][:, 1] / figure.bbox.height
         place = (0.88, heights.min(), 0.018, np.ptp(heights))
         figure.colorbar(bar, cax=figure.add_axes(place), label=label)
     else:
@@ -304,17 +304,11 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
         metre = float(np.linalg.norm(np.diff(on_paper(ends)[0], axis=0))) / (2 * size)  # in pixels, at the middle
         (flat, _), (place, depth) = on_paper(shadow), on_paper(every)
         order = np.argsort(-depth)
-        image = disks(
-            figure.canvas.get_width_height(),
-            np.concatenate([flat, place[order]]),
-            np.concatenate([wide, wide[order]]) * metre / 2,
-            np.concatenate([np.full((len(flat), 3), 0.8), colour[order]]),
-        )
-        for before in list(over.images):
-            before.remove()
-        pixels = over.imshow(image, extent=(0, 1, 0, 1), aspect="auto", interpolation="nearest")
+        balls.set_offsets(np.concatenate([flat, place[order]]) / figure.bbox.size)
+        balls.set_sizes((np.concatenate([wide, wide[order]]) * metre * 72 / figure.dpi) ** 2)  # in points
+        balls.set_facecolor(np.concatenate([np.full((len(flat), 3), 0.8), colour[order]]))
         title.set_text(f"t = {t:.4g} s")
-        return [pixels, title]
+        return [balls, title]
 
     return figure, draw
 
@@ -395,7 +389,7 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
     def draw(particles: Particles, values: np.ndarray, t: float) -> list[Any]:
         place, F = np.zeros((particles.count, 2)), np.tile(np.eye(2), (particles.count, 1, 1))
         place[:, :d] = particles.x
-        for (rows, stored, _), law in zip(by_material(particles), run.scene.laws, strict=True):
+        for (rows, stored, _), law in zip(particles.groups, run.scene.laws, strict=True):
             a = np.asarray(stored)
             F[rows, :d, :d] = a[:, :d, :d] if a.ndim == 3 else a[:, None, None] ** (1 / d) * np.eye(d)
             F[rows] *= 2.0 if a.ndim == 1 or law.relaxes_stress else 1.0  # F does not say how they are stretched
