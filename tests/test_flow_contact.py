@@ -47,7 +47,7 @@ def vessel(kind, deep, d=2):
 )
 def test_water_rests_in_a_vessel_askew_or_curved(kind, cells, times, d):
     """From its exact state, at so many times the explicit limit: the pressure stays within 3 % of that at the bottom,
-    in a bowl 4, the level within 0.1 %. Pushed at its faces water was 21 to 34 % off, and rose or sank by up to 0.8 %."""
+    in a bowl 4, the level within 0.1 %. Pushed at its faces water was 21 to 34 % off, and its level up to 0.8 %."""
     deep = cells * DX
     shapes, inside, surface = vessel(kind, deep, d)
     lower, upper = (np.asarray(corner) / DX for corner in inside.bounds())
