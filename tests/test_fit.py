@@ -62,7 +62,7 @@ def both():
 
 
 def test_notebooks_show_the_table_and_the_picture_of_a_fit(both):
-    assert mpm.viz.render  # it gives the view, which the import of a notebook asks for
+    assert mpm.render  # loads the room that gives the view, as a notebook does
     shown = both._repr_html_()
     assert html.escape(str(both)) in shown
     assert "data:image/png;base64,iVBOR" in shown
