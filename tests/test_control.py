@@ -181,9 +181,12 @@ def test_controls_that_break_their_promise_are_refused():
     ):
         with pytest.raises(ValueError, match=told):
             mpm.simulate(scene, particles, t1=DT, dt=DT, control=control, memory=memory)
-    total, drain = block(2, description=mpm.TotalLagrangian())[0], Outlet(mpm.Box((0.0, 0.0), (0.1, 0.1)))
-    with pytest.raises(ValueError, match="in the updated description only: drop TotalLagrangian"):
-        mpm.simulate(total, block(2)[1], t1=DT, dt=DT, control=drain)
+    scene, particles = block(2)
+    total = mpm.Scene(scene.grid, scene.material, description=mpm.TotalLagrangian())
+    moving = mpm.Scene(mpm.Grid(scene.grid.shape, scene.grid.spacing, follow=True), scene.material)
+    for other, told in ((total, "in the updated description only: drop Tot"), (moving, "window rests: drop follow")):
+        with pytest.raises(ValueError, match=told):
+            mpm.simulate(other, particles, t1=DT, dt=DT, control=Outlet(mpm.Box((0.0, 0.0), (0.1, 0.1))))
 
 
 def test_fibres_pull_along_their_direction():

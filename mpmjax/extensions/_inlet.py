@@ -17,6 +17,7 @@ def placed(scene: Scene, particles: Particles, chosen: Bool[Array, "p"], **new: 
     """Prepared particles, of which the `chosen` ones have a `new` x, v, mass and volume, move as one, and were never
     deformed."""
     require(not scene.total, "Particles enter and leave in the updated description only: drop TotalLagrangian().")
+    require(not scene.grid.follow, "Particles enter and leave where the window rests: drop follow=True of the grid.")
 
     def put(new: Any, old: Array, rows: slice = slice(None)) -> Array:
         return jnp.where(chosen[rows].reshape(-1, *[1] * (old.ndim - 1)), new, old)
@@ -46,7 +47,7 @@ class Inlet(eqx.Module):
         inlet = mpm.extensions.Inlet(jet, (1.0, 0.0), gate=mpm.HalfSpace((0.1, 0.0), (1.0, 0.0)), length=0.1)
         run = mpm.simulate(scene, inlet.particles(), t1=1.0, dt=1e-3, control=inlet)
 
-    *When it breaks*: in the total description, and with a window that follows. What is free and comes into the nozzle
+    *When it breaks*: the total description and a window that follows are refused. What is free and comes into the nozzle
     from outside is carried along. In the nozzle nothing is compressed or slowed: if it is blocked it presses without
     bound. `stable_dt` knows the density of what is there: of a material that is yet to come ask with the stock.
 
@@ -131,7 +132,7 @@ class Outlet(eqx.Module):
 
     Particles that are taken have no mass from then on, and rest at a place in the grid.
 
-    *When it breaks*: in the total description, and with a window that follows. What is taken under stress is gone from
+    *When it breaks*: the total description and a window that follows are refused. What is taken under stress is gone from
     one step to the next: the rest rebounds.
 
     Args:
