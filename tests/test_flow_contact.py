@@ -125,7 +125,7 @@ def shaken(speed, friction=0.0, motion=None, law=mpm.Fluid(1e4), push=(0.0, 0.0)
 def test_a_fluid_leaves_a_slope_and_is_not_pulled(method):
     scene, drop, normal = shaken(1.0)
     after, info = mpm.step(scene, drop, 0.0, 1e-3, method=method)
-    assert_close(info.boundaries.impulse[0], np.zeros(2), 1e-9 * float(drop.mass.sum()))
+    assert float(jnp.abs(info.boundaries.impulse[0]).max()) < 1e-9 * float(drop.mass.sum())
     assert_close(after.v @ normal, np.ones(drop.count), 1e-9)
     assert int(info.contact.violations) == 0
     still = mpm.step(dataclasses.replace(scene, gravity=(0.0, G)), shaken(0.0)[1], 0.0, 1e-3, method=method)[1]
@@ -178,4 +178,4 @@ def test_a_slope_that_moves_carries_a_fluid_that_rests_before_it(times):
     method = mpm.Explicit() if times < 1 else SEMI_IMPLICIT
     after, info = mpm.step(scene, drop, 0.0, dt, method=method)
     assert_close(after.v, np.broadcast_to([0.4, 0.7], after.v.shape), 1e-9)
-    assert_close(info.boundaries.impulse[0], np.zeros(2), 1e-9 * float(drop.mass.sum()))
+    assert float(jnp.abs(info.boundaries.impulse[0]).max()) < 1e-9 * float(drop.mass.sum())

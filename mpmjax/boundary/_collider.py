@@ -20,7 +20,7 @@ from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import ColliderConditions, Conditions, Slide, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._flow_contact import FlowContact
-from mpmjax.boundary._plane_contact import SHUT, FlatWall
+from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
 from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import between, canonical, require, require_fields
 from mpmjax.discretisation import Grid, scatter
@@ -28,7 +28,7 @@ from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, length, s
 from mpmjax.potential import surface_image
 
 _ASKEW = 1e-6  # the slope to an axis up to which a half-space is across it: a turned one is so to rounding
-FAR = 0.1  # how far behind a surface what flows is pushed though nodes hold it, in spacings
+_FAR = 0.1  # how far behind a surface what flows is pushed though nodes hold it, in spacings
 _LOOKS = 4  # places of a particle's way in which a collider is looked for
 
 
@@ -112,6 +112,19 @@ class AbstractCollider(AbstractBoundary):
         )
         return conditions, place, motion.velocity_of(place, t, dt)
 
+    def across_axes(self, t: Scalar) -> tuple[FlatWall, ...]:
+        """The planes of a half-space at time t, one across each axis, infinitely far where the normal is not along it;
+        none of other bodies."""
+        if not isinstance(self.shape, HalfSpace):
+            return ()
+        point, normal = jnp.asarray(self.shape.point), jnp.asarray(self.shape.normal)
+        if self.motion is not None:
+            point, normal = self.motion.place(point[None], t)[0], self.motion.turned(normal[None], t)[0]
+        size = jnp.abs(normal)
+        inward, along = jnp.where(normal < 0, -1, 1), size.sum() - size <= _ASKEW * size
+        places = jnp.where(along, point, jnp.where(normal < 0, jnp.inf, -jnp.inf))
+        return tuple((axis, places[axis], inward[axis]) for axis in range(self.dim))
+
     def wall_velocity(self, nodes: NodeVector, t: Scalar, dt: Scalar) -> NodeVector | None:
         return None if self.motion is None else self.motion.velocity_of(self.motion.origin(nodes, t), t, dt)
 
@@ -124,17 +137,7 @@ class AbstractHoldingCollider(AbstractCollider):
     meets_constraints: ClassVar[bool] = False
 
     def planes(self, t: Scalar) -> tuple[FlatWall, ...]:
-        """The planes of a half-space at time t, one across each axis, infinitely far where the normal is not along it;
-        none of other bodies."""
-        if not isinstance(self.shape, HalfSpace):
-            return ()
-        point, normal = jnp.asarray(self.shape.point), jnp.asarray(self.shape.normal)
-        if self.motion is not None:
-            point, normal = self.motion.place(point[None], t)[0], self.motion.turned(normal[None], t)[0]
-        size = jnp.abs(normal)
-        inward, along = jnp.where(normal < 0, -1, 1), size.sum() - size <= _ASKEW * size
-        places = jnp.where(along, point, jnp.where(normal < 0, jnp.inf, -jnp.inf))
-        return tuple((axis, places[axis], inward[axis]) for axis in range(self.dim))
+        return self.across_axes(t)
 
 
 class StickyCollider(AbstractHoldingCollider):
@@ -204,13 +207,13 @@ class SeparatingCollider(AbstractCollider):
 
     It has derivatives by its place and size, and those of its motion.
 
-    A fluid is held by nodes behind the surface that follow those before it (see `FlowContact`), so that it stays at
-    rest before any shape: its impact is without bounce.
+    A fluid is held at a half-space across an axis as by a `SeparatingBox`, elsewhere by nodes behind the surface that
+    follow those before it (see `FlowContact`), so that it stays at rest: its impact is without bounce.
 
     *When it breaks*: as a `SeparatingBox`. At corners sharper than a right angle, and surfaces that bend within a few
     spacings, a fluid's pressure is less exact. A body or part of it that is thinner than two spacings does not keep
-    material out, and one that moves through more than a spacing in a step
-    leaves some behind. Not in the total description.
+    material out, and one that moves through more than a spacing in a step leaves some behind. Not in the total
+    description.
 
     Args:
         shape: the body before its motion.
@@ -243,25 +246,34 @@ class SeparatingCollider(AbstractCollider):
     def contacts(
         self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
     ) -> tuple[AbstractContact, ...]:
-        """Springs, and for what flows a map of the nodes around faces whose gap is shut."""
+        """Springs, and what holds the nodes around faces of what flows whose gap is shut: at a half-space across an
+        axis a plane, as of a `SeparatingBox`; elsewhere a map that is less exact."""
         assert faces is not None  # as it `pushes`
         (surface,) = self.surfaces(faces.x, t, dt, faces.push_time)
         springs, flowing = surface_contact(surface, faces), faces.flowing
         if not flowing.any():
             return (springs,)
-        gap = springs.gap  # at the start, of a body that moves too
+        now, gap = surface, springs.gap  # at the start, of a body that moves too
         if self.motion is not None:
-            gap = surface_contact(self.surfaces(faces.x, t, dt, t)[0], faces).gap
-        shut = flowing & (gap[0] <= SHUT * faces.spacing)
-        around = scatter(faces.stencil, jnp.stack([flowing, shut]).astype(faces.x.dtype), None, grid.size).T > 0
+            (now,) = self.surfaces(faces.x, t, dt, t)
+            gap = surface_contact(now, faces).gap
+        shut, planes = flowing & (gap[0] <= SHUT * faces.spacing), self.across_axes(t)
+        along = jnp.isfinite(jnp.array([position for _, position, _ in planes]))
+        near = jnp.stack([flowing & ~along.any(), shut & ~along.any(), *(along[:, None] & shut)])
+        around = scatter(faces.stencil, near.astype(faces.x.dtype), None, grid.size)
         (at,), order = self.surfaces(grid.nodes(window), t, dt, t), len(faces.stencil.basis.knots) - 1
         velocity = self.wall_velocity(grid.nodes(window), t, dt)
-        image = surface_image(at.distance, at.normal.T, around[0], grid, window, order, velocity)
-        places = image.spread(around[1].astype(faces.x.dtype)[:, None])[:, 0] > 0
-        # an explicit step's springs push no face before the surface; of what is held only what went through it
+        image = surface_image(at.distance, at.normal.T, around[:, 0] > 0, grid, window, order, velocity)
+        flow = FlowContact(image, self.friction, image.spread((around[:, 1:2] > 0).astype(faces.x.dtype))[:, 0] > 0)
+        walls = wall_images(planes, faces, grid, window, velocity=velocity)
+        each = enumerate(zip(walls, planes, strict=True))
+        held = [
+            plane_contact((wall,), (plane[2],), self.friction, around[:, k + 2 :][:, :1]) for k, (wall, plane) in each
+        ]
+        # an explicit step's springs push no face before the surface; of what is held only what went through a map
         pushed = ~flowing if faces.explicit else ~shut
-        beside = pushed | (surface.distance < -FAR * faces.spacing)
-        return replace(springs, beside=beside[None]), FlowContact(image, self.friction, places)
+        beside = pushed | (~along.any() & (now.distance < -_FAR * faces.spacing))
+        return replace(springs, beside=beside[None]), flow, *held
 
     def check(self, grid: Grid, *, total: bool) -> None:
         del grid

@@ -47,9 +47,9 @@ class Inlet(eqx.Module):
         inlet = mpm.extensions.Inlet(jet, (1.0, 0.0), gate=mpm.HalfSpace((0.1, 0.0), (1.0, 0.0)), length=0.1)
         run = mpm.simulate(scene, inlet.particles(), t1=1.0, dt=1e-3, control=inlet)
 
-    *When it breaks*: the total description and a window that follows are refused. What is free and comes into the nozzle
-    from outside is carried along. In the nozzle nothing is compressed or slowed: if it is blocked it presses without
-    bound. `stable_dt` knows the density of what is there: of a material that is yet to come ask with the stock.
+    *When it breaks*: the total description and a window that follows are refused. What is free and comes into the
+    nozzle from outside is carried along. In the nozzle nothing is compressed or slowed: if it is blocked it presses
+    without bound. `stable_dt` knows the density of what is there: of a material that is yet to come ask with the stock.
 
     *Good values*: a length of three spacings or more: what enters the nozzle then shares no node with what has left.
 
@@ -132,8 +132,8 @@ class Outlet(eqx.Module):
 
     Particles that are taken have no mass from then on, and rest at a place in the grid.
 
-    *When it breaks*: the total description and a window that follows are refused. What is taken under stress is gone from
-    one step to the next: the rest rebounds.
+    *When it breaks*: the total description and a window that follows are refused. What is taken under stress is gone
+    from one step to the next: the rest rebounds.
 
     Args:
         region: the region.

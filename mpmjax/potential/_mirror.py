@@ -239,6 +239,17 @@ class Mirror(eqx.Module):
             total = jnp.where(image.carried(field.shape[1]), field, total)
         return total
 
+    def with_leaders(self, field: NodeVector) -> NodeVector:
+        """A velocity [m/s] of true nodes with V at those that others follow at a surface that moves: lumped masses are
+        BᵀMB only of what moves along a surface, so that velocities are folded relative to it."""
+        walls = [image for image in self.images if isinstance(image, WallImage | SurfaceImage)]
+        true = ~reduce(jnp.logical_or, (image.carried(field.shape[1]) for image in walls), jnp.zeros(field.shape, bool))
+        for image in self.moving:
+            if isinstance(image, SurfaceImage) and image.velocity is not None:
+                leads = true & image.reached(field.shape)
+                field = jnp.where(leads, self.unscaled(jnp.where(leads, image.velocity, 0)), field)
+        return field
+
     def with_motion(self, velocity: NodeVector) -> NodeVector:
         """A velocity [m/s], shape (n, d), with 2V in its odd components beyond mirrors that move, and (1 − B) V behind
         walls that do. Where several mirrors reach, the first one holds, of walls the last."""

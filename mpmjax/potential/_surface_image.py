@@ -147,8 +147,9 @@ def one_mass(masses: Float[Array, "n d d"], mass: NodeScalar, fixed: Mask) -> tu
     d, eye = masses.shape[-1], jnp.eye(masses.shape[-1], dtype=masses.dtype)
     held = jnp.abs(masses).sum(axis=2)[..., None] * eye
     masses = jnp.where(fixed.any(axis=1)[:, None, None], held, masses)
-    some = (mass > 0) & (masses * eye).sum(axis=2).all(axis=1)
-    masses = jnp.where(some[:, None, None], masses, eye)
+    some = mass > 0
+    lacking = (masses * eye).sum(axis=2) == 0  # components that follow others at a wall across their axis
+    masses = jnp.where(some[:, None, None], masses + jnp.where(lacking, mass[:, None], 0)[:, None] * eye, eye)
     M, root = la.entries(jnp.moveaxis(masses, 0, -1)), jnp.sqrt(jnp.where(some, mass, 1))
     L = [[jnp.zeros_like(mass)] * d for _ in range(d)]
     A = [[jnp.zeros_like(mass)] * d for _ in range(d)]
