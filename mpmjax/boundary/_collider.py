@@ -266,10 +266,8 @@ class SeparatingCollider(AbstractCollider):
         image = surface_image(at.distance, at.normal.T, around[:, 0] > 0, grid, window, order, velocity)
         flow = FlowContact(image, self.friction, image.spread((around[:, 1:2] > 0).astype(faces.x.dtype))[:, 0] > 0)
         walls = wall_images(planes, faces, grid, window, velocity=velocity)
-        each = enumerate(zip(walls, planes, strict=True))
-        held = [
-            plane_contact((wall,), (plane[2],), self.friction, around[:, k + 2 :][:, :1]) for k, (wall, plane) in each
-        ]
+        each = enumerate(zip(walls, planes, strict=True), 2)
+        held = [plane_contact((wall,), (plane[2],), self.friction, around[:, k, None]) for k, (wall, plane) in each]
         # an explicit step's springs push no face before the surface; of what is held only what went through a map
         pushed = ~flowing if faces.explicit else ~shut
         beside = pushed | (~along.any() & (now.distance < -_FAR * faces.spacing))
