@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -165,15 +164,10 @@ def test_the_derivative_by_a_colliders_motion_with_a_fluid_is_that_of_difference
     assert_close(jax.grad(height)(at), jnp.stack(differences), 1e-7)
 
 
-@pytest.mark.parametrize("times", thorough(0.7, 9.0))
+@pytest.mark.parametrize("times", [0.7, *thorough(9.0)])
 def test_a_slope_that_moves_carries_a_fluid_that_rests_before_it(times):
     """At the speed of the slope, in any direction, nothing pushes: the drop goes on as it is."""
     scene, drop, _ = shaken(0.0, 0.0, mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.4, 0.7))), push=(0.4, 0.7))
-    scene = eqx.tree_at(
-        lambda s: s.boundary[0],
-        scene,
-        shaken(0.0, 0.0, mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.4, 0.7))))[0].boundary[0],
-    )
     dt = times * float(mpm.stable_dt(scene, drop, safety=1.0))
     method = mpm.Explicit() if times < 1 else SEMI_IMPLICIT
     after, info = mpm.step(scene, drop, 0.0, dt, method=method)
