@@ -161,7 +161,7 @@ def test_a_fault_is_named_with_the_scene_of_its_step():
     assert float(run.final_memory) == float(run.final_step) == len(run) - 1
 
 
-def test_controls_that_break_their_promise_are_refused():
+def test_controls_that_break_their_promise_are_refused(tmp_path):
     scene, particles = block(2, material=MUSCLE)
     walled, _ = block(2, material=MUSCLE, boundary=GRIP)
 
@@ -179,8 +179,10 @@ def test_controls_that_break_their_promise_are_refused():
         (Outlet(mpm.Box((0.0,) * 3, (1.0,) * 3)), None, "region must have 2 coordinates, as the run, got 3"),
         (replace(jet(1.0)[1], first=5), None, "from number 5 on must be among the 36 of the run"),
     ):
+        of = {"t1": DT, "dt": DT, "save_every": 1, "control": control, "memory": memory}
         with pytest.raises(ValueError, match=told):
-            mpm.simulate(scene, particles, t1=DT, dt=DT, control=control, memory=memory)
+            mpm.record(tmp_path / "run.h5", scene, particles, **of)
+        assert not list(tmp_path.iterdir())
     scene, particles = block(2)
     total = mpm.Scene(scene.grid, scene.material, description=mpm.TotalLagrangian())
     moving = mpm.Scene(mpm.Grid(scene.grid.shape, scene.grid.spacing, follow=True), scene.material)

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -127,11 +128,15 @@ def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
                 require(len(groups) == 1, "[particles] file has all particles of a scene: make it the only table.")
                 require(n == 1, "[particles] file: particles from a file cannot be refined, give them a region.")
                 particles = particles_in(**arguments(particles_in, groups[0], "[particles]"))
-                particles = canonical(particles, run.precision or particles.x.dtype)
+                particles, overlap = canonical(particles, run.precision or particles.x.dtype), False
             else:
-                particles = _filled(scene, groups, run.precision)
+                particles, overlap = _filled(scene, groups, run.precision)
             scene = attach(scene, particles)
-            return scene, prepare(scene, particles)
+            if not overlap:
+                return scene, prepare(scene, particles)
+            with warnings.catch_warnings():  # of the overlap `_filled` has told, with the numbers of the tables
+                warnings.filterwarnings("ignore", "Near .* particles take")
+                return scene, prepare(scene, particles)
 
         scene, particles = build(1)
         if run.dt is not None and not isinstance(run.dt, str):
@@ -229,8 +234,9 @@ def _lists(material: Any) -> list[str]:
     return [key for key, value in items if isinstance(value, list)] + [k for _, v in items for k in _lists(v)]
 
 
-def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
-    """The particles of all tables, those of each material together, in the materials' order."""
+def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> tuple[Particles, bool]:
+    """The particles of all tables, those of each material together, in the materials' order, and whether tables
+    overlap, with a warning."""
     filled: list[list[Particles]] = [[] for _ in scene.laws]
     placed: list[tuple[int, AbstractRegion, np.ndarray]] = []
     grid, dx = scene.grid, float(scene.grid.spacing)
@@ -264,12 +270,14 @@ def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
             placed.append((number, region, np.asarray(filled[material - 1][-1].x)))
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
+    overlap = False
     for (i, region, _), (j, _, x) in itertools.combinations(placed, 2):
         lower, upper = region.bounds()
         if ((x.min(axis=0) >= upper) | (x.max(axis=0) <= lower)).any():
             continue
         inside = int(np.asarray(region.contains(jnp.asarray(x), -1e-3 * dx)).sum())  # deeper than rounding has it
         if inside:
+            overlap = True
             warn(
                 f"{inside} particles of [[particles]] {j} lie in the region of [[particles]] {i}: where two fill the "
                 "same place there is twice the mass."
@@ -277,4 +285,4 @@ def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
     for number, sets in enumerate(filled):
         place = f"[material.{scene.names[number]}]" if scene.names else f"[[material]] {number + 1}"
         require(len(sets) > 0, f"{place} has no particles: name it in a [[particles]] table, or leave it out.")
-    return join(*(replace(join(*sets), counts=None) for sets in filled))
+    return join(*(replace(join(*sets), counts=None) for sets in filled)), overlap
