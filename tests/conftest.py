@@ -45,6 +45,11 @@ if jax.__version_info__ < (0, 11):  # later ones end at a flag that they do not 
     QUICK_TO_COMPILE.append("--xla_cpu_use_fusion_emitters=false")
 
 
+def pytest_sessionfinish() -> None:
+    """At its end pytest looks for cycles several times, a second each in what compiled programs are made of."""
+    gc.freeze()
+
+
 def pytest_runtest_teardown(item: Any, nextitem: Any) -> None:
     """Drop compiled programs that no later test shares, or that are too many. Modules share operations outside of
     programs and some scenes, a tenth of the default run's time. Each program holds memory maps, of which a process may
