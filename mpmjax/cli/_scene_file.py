@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,21 +31,18 @@ class RunSettings(eqx.Module):
     dt: Scalar | str | None = None  # step [s], or "stable"; None for "auto"
     method: AbstractIntegrator | None = None  # None for "auto"
     save_every: int | None = None  # steps from frame to frame; None if the file does not say
-    precision: str | None = None  # None for JAX's own, in the shell float64
+    precision: Literal["float32", "float64"] | None = None  # None for JAX's own, in the shell float64
     error: float = eqx.field(converter=float, default=1e-2)  # relative error that "auto" aims at
     most_seconds: float = eqx.field(converter=float, default=60.0)  # seconds that its pilot runs may take
 
     def __check_init__(self):
-        require_positive("[run] t1", self.t1)
         if isinstance(self.dt, str):
             require(self.dt == "stable", f'[run] dt must be a step in seconds, "stable" or "auto", got {self.dt!r}.')
         elif self.dt is not None:
             require_positive("[run] dt", self.dt)
-        require_positive("[run] error", self.error)
-        require_positive("[run] most_seconds", self.most_seconds)
+        for name in ("t1", "error", "most_seconds"):
+            require_positive(f"[run] {name}", getattr(self, name))
         every = self.save_every is None or self.save_every >= 1
-        is_dtype = self.precision in ("float32", "float64", None)
-        require(is_dtype, f'[run] precision must be "float32" or "float64", got {self.precision!r}.')
         double = jnp.result_type(float) == jnp.float64 or self.precision != "float64"
         require(double, '[run] precision = "float64" needs jax.config.update("jax_enable_x64", True) first.')
         require(every, f"[run] save_every must be at least 1, got {self.save_every}.")
