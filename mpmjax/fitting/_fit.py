@@ -164,7 +164,8 @@ def fit(
     result = replace(result, history=history, screening=screening)
     if not result.converged:
         stopped = "was interrupted" if result.interrupted else "did not converge"
-        advice = "" if result.interrupted or optimiser.has_stalled(end.inner) else f" {_ADVICE}"
+        advice = " Raise max_steps, start closer, or give a rtol that the precision can reach."
+        advice = "" if result.interrupted or optimiser.has_stalled(end.inner) else advice
         warn(f"The fit {stopped} after {len(result.history)} iterations: its errors hold only at a minimum.{advice}")
     elif changing:
         warn(f"The noise of the observations did not settle in {MOST_ROUNDS} rounds: give the sigma of one of them.")
@@ -374,4 +375,3 @@ MOST_COLUMNS = 32
 MOST_ROUNDS = 20  # most re-estimations of the noise
 _MOST_NAMES = 6
 _ROUNDINGS = 10  # derivatives by a coordinate below so many roundings of the data are none
-_ADVICE = "Raise max_steps, start closer, or give a rtol that the precision can reach."

@@ -79,11 +79,11 @@ class LevenbergMarquardt(AbstractOptimiser):
             else:
                 z, seen, reach, refused = before.z, before.seen, reach / _SHORTER, int(state.refused) + 1
                 longest = np.abs(moved).max() / _SHORTER if refused > 1 else np.inf
-            lately = before.history[-_LATELY:]
-            often = sum(not i.accepted for i in lately) >= _LATELY / 2
+            lately, freedom = before.history[-_LATELY:], max(len(r) - len(moved), 1)
+            often = len(lately) == _LATELY and sum(not i.accepted for i in lately) >= _LATELY / 2
             near = bool((np.abs(z - lately[0].z) <= _NOWHERE).all())
             gained = 2 * lately[0].cost - min((r**2).sum(), (last**2).sum())
-            stalled = len(lately) == _LATELY and often and near and gained <= _SLOW * _variance(last, J)
+            stalled = often and near and gained <= _SLOW / freedom * (last**2).sum()
         r, J = _exact(seen)
         if not np.isfinite(J).all():
             return z, state, seen
@@ -91,7 +91,8 @@ class LevenbergMarquardt(AbstractOptimiser):
         damping = 1 / np.clip(reach, *_REACHES)
         damping = np.append(damping, np.maximum(damping, lengths[0] ** 2 * np.logspace(-16, 8, 97)))
         steps = -Vt.T @ ((lengths * (U.T @ r))[:, None] / (lengths[:, None] ** 2 + damping))
-        furthest = np.where(_bounded(seen), np.minimum(_FURTHEST / _SHORTER**refused, longest), longest)[:, None]
+        bent = np.isfinite(np.asarray(seen.room)).any(axis=0)  # coordinates of numbers with a bound
+        furthest = np.minimum(np.where(bent, _FURTHEST / _SHORTER**refused, np.inf), longest)[:, None]
         short = (np.abs(steps) <= furthest).all(axis=0)
         step = steps[:, short.argmax() if short.any() else -1]
         wanted = np.abs(np.linalg.lstsq(J, -r)[0]).max()
@@ -108,19 +109,16 @@ class LevenbergMarquardt(AbstractOptimiser):
             return True
         # Refused, and what it could have lowered Σ r² by is lost in the rounding, or a tenth of a standard error away.
         r, J, step, _ = _gauss_newton(seen)
-        rounding = _ROUNDINGS * float(np.finfo(np.asarray(seen.residuals).dtype).eps) * (r**2).sum()
-        gain = (r**2).sum() - ((r + J @ step) ** 2).sum()
-        return bool(state.refused > 0 and gain <= max(rounding, _LITTLE * _variance(r, J)))
-
-    def has_stalled(self, state: "DampedState") -> bool:
-        return bool(state.stalled)
+        rounding = _ROUNDINGS * float(np.finfo(np.asarray(seen.residuals).dtype).eps)
+        share = max(rounding, _LITTLE / max(len(r) - len(step), 1))
+        return bool(state.refused > 0 and ((r + J @ step) ** 2).sum() >= (1 - share) * (r**2).sum())
 
     def distance(self, state: "DampedState", seen: Evaluation) -> float:
         r, J, step, limited = _gauss_newton(seen)
         rows, columns = J.shape
         if rows <= columns or not np.isfinite(step).all():
             return float("nan")
-        error = np.sqrt(_variance(r, J))
+        error = np.sqrt((r**2).sum() / (rows - columns))
         # Data without noise leave no error to compare with: towards a bound the tolerance of residuals ends it.
         least = float(self.rtol) if limited.any() and np.abs(step[~limited]).max(initial=0) <= self.rtol else 0.0
         length = float(np.linalg.norm(J @ step))
@@ -134,8 +132,7 @@ class DampedState(NamedTuple):
     reach: Float[Array, ""]  # one over the damping
     refused: Int[Array, ""]  # how many steps in a row were refused
     settled: Bool[Array, ""]  # whether the last step was within the tolerances
-    stalled: Bool[Array, ""]
-    """Whether it was so since longer ones were refused: the simulation fails beyond, or the misfit has a kink."""
+    stalled: Bool[Array, ""]  # whether it leads nowhere: the misfit has a kink, or simulations fail beyond
 
 
 def _exact(seen: Evaluation) -> tuple[np.ndarray, np.ndarray]:
@@ -159,17 +156,6 @@ def _to_a_bound(seen: Evaluation, damped: np.ndarray) -> np.ndarray | None:
     straight = side * np.minimum(np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1)), _LEAP)
     wanted = np.where(near, straight, step)
     return wanted if (near & (np.abs(damped) < np.abs(wanted) / 2)).any() else None
-
-
-def _variance(r: np.ndarray, J: np.ndarray) -> float:
-    """The variance of the residuals, by their misfit."""
-    return float((r**2).sum()) / max(len(r) - J.shape[1], 1)
-
-
-def _bounded(seen: Evaluation) -> np.ndarray:
-    """Which numbers have a bound, and so coordinates in which they are bent."""
-    down, up = np.isfinite(np.asarray(seen.room))
-    return down | up
 
 
 def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -230,9 +216,6 @@ class LBFGS(AbstractOptimiser):
 
     def has_converged(self, state: "LBFGSState", seen: Evaluation) -> bool:
         return bool((state.small > 1) | (state.stalled & (state.predicted_decrease <= state.decrease_tolerance)))
-
-    def has_stalled(self, state: "LBFGSState") -> bool:
-        return bool(state.stalled)
 
     def _search(
         self, problem: FitProblem, sigmas: Sigmas, z: Coordinates, state: "LBFGSState"

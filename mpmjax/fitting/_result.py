@@ -291,8 +291,8 @@ def fit_result(
     texts = seen_together(problem.labels, errors, problem.logarithmic)
     if not minimum.converged and optimiser.has_stalled(minimum.inner):
         texts.append(
-            "The search ended where no step is taken that is long enough to matter: the misfit has a kink there, as "
-            "where friction begins to stick, or simulations fail beyond. Errors hold the step that it left undone."
+            "The search ended at a kink of the misfit, as where friction begins to stick, or where simulations fail "
+            "beyond: errors hold the step that it left undone."
         )
     result = FitResult(
         problem=problem,

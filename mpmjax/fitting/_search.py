@@ -59,8 +59,8 @@ class AbstractOptimiser(eqx.Module):
         return float("nan")
 
     def has_stalled(self, state: Any) -> bool:
-        """Whether the search goes no further, and is not known to be at a minimum."""
-        return False
+        """Whether the search goes no further, and is not known to be at a minimum. Default: the state's `stalled`."""
+        return bool(getattr(state, "stalled", False))
 
 
 class Iteration(NamedTuple):
@@ -268,13 +268,13 @@ def batch_size(problem: FitProblem, batch: int | None, count: int) -> int:
     return min(8 if all(e.method.is_explicit for e in problem.experiments) else 1, count)
 
 
-def counted(progress: Callable[[str], None] | None, text: str, *, again: bool = True) -> Callable[[int, int], None]:
-    """Progress of many in lines, of a text such as "{} of {} searches are done": each time, or whenever more are."""
+def counted(progress: Callable[[str], None] | None, text: str) -> Callable[[int, int], None]:
+    """Progress of many in lines, of a text such as "{} of {} searches are done", whenever more are."""
     told = 0
 
     def say(done: int, count: int) -> None:
         nonlocal told
-        if progress is not None and (again or done > told):
+        if progress is not None and done > told:
             told = done
             progress(text.format(done, count))
 
