@@ -289,6 +289,8 @@ def fit_result(
         reported.append(Estimate(name, number, both[0][0], ends, "", start, False, both[1][0], alone))
     degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
     texts = seen_together(problem.labels, errors, problem.logarithmic)
+    if isinstance(moved, str):
+        texts.append(f"On twice the spacing nothing is known, so that errors hold nothing of the grid: {moved}")
     if not minimum.converged and optimiser.has_stalled(minimum.inner):
         texts.append(
             "The search ended at a kink of the misfit, as where friction begins to stick, or where simulations fail "
