@@ -33,8 +33,8 @@ class Starts(eqx.Module):
     where that search comes to no minimum.
 
     A search within a hundredth, in each coordinate, of another with a lower cost is ended, and counted where that one
-    ends; one whose sum of squares three moves, or six iterations, have lowered by less than a hundredth is ended as at
-    a minimum. Those within twice the least sum of squares are searched on, and the best is then fitted.
+    ends; one whose sum of squares three moves have lowered by less than a hundredth, or that goes no further, is ended
+    as at a minimum. Those within twice the least sum of squares are searched on, and the best is then fitted.
 
     Two ended at one minimum where their coordinates differ by less than two hundredths, or the misfit hides that:
     Δᵀ JᵀJ Δ ≤ n s² of n coordinates, with J and s² = Σ r²/(m − n) of the better one, s² at least one where σ is given.
