@@ -259,6 +259,27 @@ def test_a_number_that_is_known_to_its_eighth_digit_has_a_profile():
     assert np.subtract(profile.interval, 1) * 1e8 == pytest.approx(norm.ppf([0.025, 0.975]), rel=2e-3)
 
 
+class Kinked(Abrupt):
+    """3 |z − 0.3| + 1 and noise ±1, as where friction begins to stick: a straight line asks for steps across z = 0.3,
+    of 1/3, which no step finds."""
+
+    def residuals(self, z, sigmas, adjoint):
+        return 3 * jnp.abs(z - 0.3) + 1 + jnp.asarray(np.arange(STEPS) % 2 * 2.0 - 1), jnp.zeros(1)
+
+
+def test_a_search_that_meets_a_kink_ends_soon_says_so_and_holds_the_step_left_undone():
+    lm, problem = mpm.fitting.LevenbergMarquardt(), Kinked(0.0)
+    found = search_many([(problem, (jnp.ones(()),))], lm, {0: np.zeros(1)})[0]
+    assert not found.converged
+    assert len(found.history) < 25
+    assert float(found.z[0]) == pytest.approx(0.3, abs=1e-2)
+    result = fit_result(problem, lm, found, GIVEN_NOISE, {}, 0.95)
+    assert any("kink" in text for text in result.warnings)
+    (estimate,) = result.estimates
+    assert estimate.interval[0] < 1.3 - 0.3 < 1.3 + 0.3 < estimate.interval[1]
+    assert np.ptp(estimate.noise_interval) < 0.4
+
+
 class Line(FitProblem):
     """A straight line in the place of a simulation: y = A (a, b), σ = 1."""
 

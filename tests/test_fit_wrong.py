@@ -306,9 +306,10 @@ def test_a_wall_that_the_coarse_grid_cannot_have_is_said():
     """A plane must lie at a multiple of half a spacing: of one that does not on twice the spacing nothing is known."""
     experiment = wave(1)
     shifted = eqx.tree_at(lambda e: e.scene.boundary[1].position, experiment, jnp.asarray(1.03125))
-    found, alone = (mpm.fit(shifted, stiffness(1e4), starts=1, discretisation=looks) for looks in (True, False))
+    with pytest.warns(UserWarning, match="errors hold nothing of the grid: A SymmetryPlane must lie at a multiple"):
+        found, alone = (mpm.fit(shifted, stiffness(1e4), starts=1, discretisation=looks) for looks in (True, False))
     assert found["E"].interval == alone["E"].interval
-    assert "on twice the spacing: not known: A SymmetryPlane must lie at a multiple" in str(found)
+    assert "errors hold nothing of the grid" in str(found)
 
 
 def test_a_fit_on_finer_grids_starts_from_all_minima_and_says_what_its_misfit_is(both_grids):

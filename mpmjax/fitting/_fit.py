@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Scalar
-from mpmjax.checks import between, checked, require, warn
+from mpmjax.checks import between, checked, require, shortened, warn
 from mpmjax.fitting._discretisation import look_at_coarse_grid
 from mpmjax.fitting._estimate import table
 from mpmjax.fitting._evaluation import Evaluation
@@ -164,7 +164,8 @@ def fit(
     result = replace(result, history=history, screening=screening)
     if not result.converged:
         stopped = "was interrupted" if result.interrupted else "did not converge"
-        advice = "" if result.interrupted else f" {_ADVICE}"
+        advice = " Raise max_steps, start closer, or give a rtol that the precision can reach."
+        advice *= not result.interrupted and not optimiser.has_stalled(end.inner)
         warn(f"The fit {stopped} after {len(result.history)} iterations: its errors hold only at a minimum.{advice}")
     elif changing:
         warn(f"The noise of the observations did not settle in {MOST_ROUNDS} rounds: give the sigma of one of them.")
@@ -235,10 +236,9 @@ def require_influence(problem: FitProblem, sigmas: Sigmas, seen: Evaluation) -> 
     else:
         size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
     unseen = [label for label, length in zip(problem.labels, size, strict=True) if length <= rounding]
-    more = f" and {len(unseen) - _MOST_NAMES} more" if len(unseen) > _MOST_NAMES else ""
     require(
         not unseen,
-        f"The data do not depend on {', '.join(unseen[:_MOST_NAMES])}{more}: their derivative by it is zero but for "
+        f"The data do not depend on {shortened(', '.join(unseen))}: their derivative by it is zero but for "
         "rounding. Leave it out, give it a prior, or observe what it changes.",
     )
 
@@ -372,9 +372,4 @@ def fit_ensemble(
 MOST_COLUMNS = 32
 """Columns of a Jacobian, or rows at what they cost more, up to which Levenberg-Marquardt is the cheaper."""
 MOST_ROUNDS = 20  # most re-estimations of the noise
-_MOST_NAMES = 6
 _ROUNDINGS = 10  # derivatives by a coordinate below so many roundings of the data are none
-_ADVICE = (
-    "Raise max_steps, start closer, give a rtol that the precision can reach, or see whether simulations fail or the "
-    "misfit has a kink where it ended."
-)

@@ -24,15 +24,18 @@ class LevenbergMarquardt(AbstractOptimiser):
     λ is first one, the square of a coordinate's natural step; it falls by 3.5 where a step lowers Σ r² as foretold, and
     grows fourfold where one does not lower it by a hundredth of that, or a simulation fails: that one is not taken. It
     is larger where a number with a bound would move by more than 2 in its coordinate, a modulus sevenfold, or a quarter
-    of that for each refusal before: so far no straight line knows the way.
+    of that for each refusal before: so far no straight line knows the way. From the second refusal on the next step is
+    a quarter of the refused one at most.
 
     Near a bound the coordinate hides the value from it: the damping then holds a step that the data ask for. There the
     next one is the Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds.
 
     It ends where a step changes nothing by more than the tolerance, where the next Gauss-Newton step, no longer than to
     a bound, is less than a ten-thousandth of the standard error that the misfit gives, or where one is refused and
-    could lower Σ r² by no more than its rounding. Where only steps far shorter than the Gauss-Newton step are taken,
-    since the simulation fails beyond or the misfit has a kink, it has not converged.
+    could lower Σ r² by no more than its rounding, or a hundredth of the variance σ² = Σ r²/(m − n). Where six
+    iterations, half of them refused, lower it by less than a tenth of σ² and move no coordinate by more than 0.03, or
+    only steps far shorter than the Gauss-Newton step are taken, the misfit has a kink or simulations fail beyond: it
+    ends, and has not converged.
 
     Args:
         rtol: relative and absolute tolerance of coordinates and residuals.
@@ -61,7 +64,8 @@ class LevenbergMarquardt(AbstractOptimiser):
     def directed(
         self, before: Search, z: Coordinates, state: "DampedState", seen: Evaluation
     ) -> tuple[Coordinates, "DampedState", Evaluation]:
-        reach, refused, settled, tolerance = float(state.reach), 0, False, float(self.rtol)
+        reach, refused, longest, tolerance = float(state.reach), 0, np.inf, float(self.rtol)
+        settled = stalled = False
         if before.history:
             (last, J), (r, _) = _exact(before.seen), _exact(seen)
             moved = np.asarray(z - before.z, float)
@@ -74,35 +78,40 @@ class LevenbergMarquardt(AbstractOptimiser):
                 settled = bool((np.abs(changes) < tolerance * (1 + sizes)).all())
             else:
                 z, seen, reach, refused = before.z, before.seen, reach / _SHORTER, int(state.refused) + 1
+                longest = np.abs(moved).max() / _SHORTER if refused > 1 else np.inf
+            lately, freedom = before.history[-_LATELY:], max(len(r) - len(moved), 1)
+            often = len(lately) == _LATELY and sum(not i.accepted for i in lately) >= _LATELY / 2
+            near = bool((np.abs(z - lately[0].z) <= _NOWHERE).all())
+            gained = 2 * lately[0].cost - min((r**2).sum(), (last**2).sum())
+            stalled = often and near and gained <= _SLOW / freedom * (last**2).sum()
         r, J = _exact(seen)
         if not np.isfinite(J).all():
             return z, state, seen
         U, lengths, Vt = np.linalg.svd(J, full_matrices=False)
         damping = 1 / np.clip(reach, *_REACHES)
-        damping = np.append(damping, np.maximum(damping, lengths[0] ** 2 * np.logspace(-16, 4, 81)))
+        damping = np.append(damping, np.maximum(damping, lengths[0] ** 2 * np.logspace(-16, 8, 97)))
         steps = -Vt.T @ ((lengths * (U.T @ r))[:, None] / (lengths[:, None] ** 2 + damping))
-        short = (np.abs(steps[_bounded(seen)]) <= _FURTHEST / _SHORTER**refused).all(axis=0)
+        bent = np.isfinite(np.asarray(seen.room)).any(axis=0)  # coordinates of numbers with a bound
+        furthest = np.minimum(np.where(bent, _FURTHEST / _SHORTER**refused, np.inf), longest)[:, None]
+        short = (np.abs(steps) <= furthest).all(axis=0)
         step = steps[:, short.argmax() if short.any() else -1]
         wanted = np.abs(np.linalg.lstsq(J, -r)[0]).max()
         held = wanted > _FAR * tolerance and np.abs(step).max() < _REFUSED * wanted
         if not refused and (straight := _to_a_bound(seen, step)) is not None:
             # If it is refused, damped steps go on as if it had not been tried.
             step, reach = straight, reach * _SHORTER
-        after = np.asarray(z, float) + step, reach, refused, settled and not held, settled and held
+        after = np.asarray(z, float) + step, reach, refused, settled and not held, stalled or (settled and held)
         kinds = (leaf.dtype for leaf in state)
         return z, DampedState(*map(jnp.asarray, after, kinds)), seen
 
     def has_converged(self, state: "DampedState", seen: Evaluation) -> bool:
         if state.settled or self.distance(state, seen) <= 1:
             return True
-        # Refused, and what it could have lowered Σ r² by is lost in the rounding.
+        # Refused, and what it could have lowered Σ r² by is lost in the rounding, or a tenth of a standard error away.
         r, J, step, _ = _gauss_newton(seen)
-        rounding = _ROUNDINGS * float(np.finfo(np.asarray(seen.residuals).dtype).eps) * (r**2).sum()
-        gain = (r**2).sum() - ((r + J @ step) ** 2).sum()
-        return bool(state.refused > 0 and gain <= rounding)
-
-    def has_stalled(self, state: "DampedState") -> bool:
-        return bool(state.stalled)
+        rounding = _ROUNDINGS * float(np.finfo(np.asarray(seen.residuals).dtype).eps)
+        share = max(rounding, _LITTLE / max(len(r) - len(step), 1))
+        return bool(state.refused > 0 and ((r + J @ step) ** 2).sum() >= (1 - share) * (r**2).sum())
 
     def distance(self, state: "DampedState", seen: Evaluation) -> float:
         r, J, step, limited = _gauss_newton(seen)
@@ -123,8 +132,7 @@ class DampedState(NamedTuple):
     reach: Float[Array, ""]  # one over the damping
     refused: Int[Array, ""]  # how many steps in a row were refused
     settled: Bool[Array, ""]  # whether the last step was within the tolerances
-    stalled: Bool[Array, ""]
-    """Whether it was so since longer ones were refused: the simulation fails beyond, or the misfit has a kink."""
+    stalled: Bool[Array, ""]  # whether it leads nowhere: the misfit has a kink, or simulations fail beyond
 
 
 def _exact(seen: Evaluation) -> tuple[np.ndarray, np.ndarray]:
@@ -148,12 +156,6 @@ def _to_a_bound(seen: Evaluation, damped: np.ndarray) -> np.ndarray | None:
     straight = side * np.minimum(np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1)), _LEAP)
     wanted = np.where(near, straight, step)
     return wanted if (near & (np.abs(damped) < np.abs(wanted) / 2)).any() else None
-
-
-def _bounded(seen: Evaluation) -> np.ndarray:
-    """Which numbers have a bound, and so coordinates in which they are bent."""
-    down, up = np.isfinite(np.asarray(seen.room))
-    return down | up
 
 
 def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -214,9 +216,6 @@ class LBFGS(AbstractOptimiser):
 
     def has_converged(self, state: "LBFGSState", seen: Evaluation) -> bool:
         return bool((state.small > 1) | (state.stalled & (state.predicted_decrease <= state.decrease_tolerance)))
-
-    def has_stalled(self, state: "LBFGSState") -> bool:
-        return bool(state.stalled)
 
     def _search(
         self, problem: FitProblem, sigmas: Sigmas, z: Coordinates, state: "LBFGSState"
@@ -379,6 +378,9 @@ _LONGER, _SHORTER = 3.5, 4.0  # factors of the reach where a step was as foretol
 _REACHES = 1e-300, 1e300
 _FAR = 100.0  # a step is short below so many tolerances
 _REFUSED = 0.1  # part of the Gauss-Newton step below which a step is held back
+_LATELY = 6  # iterations, half of them refused, that lead nowhere where a misfit is not smooth
+_NOWHERE, _SLOW = 0.03, 0.1  # how far they move a coordinate [-], by what part of the variance they lower Σ r², at most
+_LITTLE = 0.01  # part of the variance by which a step of a tenth of a standard error lowers Σ r²
 _FURTHEST = 2.0  # longest step of a coordinate with a bound [-]
 _LEAP = 9.0  # longest step to a bound [-]: to a ten-thousandth of the distance from it
 _HIDDEN = 3.0  # standard errors from a bound within which a coordinate is near it

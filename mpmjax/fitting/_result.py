@@ -260,7 +260,11 @@ def fit_result(
         noises.append(NoiseEstimate(o.name, float(size), not is_given, float(misfit), o.count, worth, kind, beyond))
     held, slope = at_bound(r, J, np.asarray(problem.room(z))), jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1]
     gradient, size = (J.T @ r) * held, np.abs(np.asarray(slope, float))
-    noise_alone, errors = uncertainty(J, eps, of_noise), uncertainty(J, eps, of_misfit, moved)
+    off = [moved] if isinstance(moved, np.ndarray) else []
+    if not minimum.converged:
+        off.append(uncertainty(J * ~held, eps, ()).inverse @ (J.T @ r))
+    noise_alone = uncertainty(J, eps, of_noise)
+    errors = uncertainty(J, eps, of_misfit, np.vstack(off) if off else None)
     seen = np.isfinite(errors.error)
     wider = np.where(seen, errors.error, 1) / np.where(seen, noise_alone.error, 1)
     (lower, upper), alone = (
@@ -285,6 +289,13 @@ def fit_result(
         reported.append(Estimate(name, number, both[0][0], ends, "", start, False, both[1][0], alone))
     degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
     texts = seen_together(problem.labels, errors, problem.logarithmic)
+    if isinstance(moved, str):
+        texts.append(f"On twice the spacing nothing is known, so that errors hold nothing of the grid: {moved}")
+    if not minimum.converged and optimiser.has_stalled(minimum.inner):
+        texts.append(
+            "The search ended at a kink of the misfit, as where friction begins to stick, or where simulations fail "
+            "beyond: errors hold the step that it left undone."
+        )
     result = FitResult(
         problem=problem,
         z=np.asarray(z),

@@ -59,8 +59,8 @@ class AbstractOptimiser(eqx.Module):
         return float("nan")
 
     def has_stalled(self, state: Any) -> bool:
-        """Whether the search goes no further, and is not known to be at a minimum."""
-        return False
+        """Whether the search goes no further, and is not known to be at a minimum. Default: the state's `stalled`."""
+        return bool(getattr(state, "stalled", False))
 
 
 class Iteration(NamedTuple):
@@ -120,8 +120,8 @@ def search_many(
         starts: where each starts, by its number.
         joining: a search that comes so near to another one of one problem with a lower cost, in each coordinate, is
             ended: it would go the same way. Zero ends none.
-        settling: a search is at a minimum too where its last three moves, or six iterations, lowered the cost by less
-            than this part of it: Gauss-Newton steps are slow where residuals are large. Zero ends none.
+        settling: a search is at a minimum too where its last three moves lowered the cost by less than this part of it,
+            since Gauss-Newton steps are slow where residuals are large, or where it goes no further. Zero ends none.
         state: in the place of its start, an earlier state of the first search, which is continued exactly.
         done: earlier searches, by their numbers, which are returned with the others.
         enough: says of each search that has ended whether those that wait need not begin; they are left out.
@@ -149,9 +149,8 @@ def search_many(
         del running[k]
 
     def settled(history: tuple[Iteration, ...]) -> bool:
-        costs, moves = [i.cost for i in history], [i.cost for i in history if i.accepted]
-        slow = len(moves) > 1 and len(costs) > _ITERATIONS and costs[-1] > (1 - settling) * costs[-1 - _ITERATIONS]
-        return slow or (len(moves) > _MOVES and moves[-1] > (1 - settling) * moves[-1 - _MOVES])
+        moves = [i.cost for i in history if i.accepted]
+        return len(moves) > _MOVES and moves[-1] > (1 - settling) * moves[-1 - _MOVES]
 
     try:
         while True:
@@ -163,10 +162,8 @@ def search_many(
                     end(k, failure=NO_DERIVATIVE)
                 elif settled(search.history) or optimiser.has_converged(search.inner, search.seen):
                     end(k, converged=True)
-                elif len(search.history) >= optimiser.max_steps or (
-                    settling == 0 and optimiser.has_stalled(search.inner)
-                ):
-                    end(k)  # where searches settle, one that stalls goes on, and soon has settled
+                elif (stalled := optimiser.has_stalled(search.inner)) or len(search.history) >= optimiser.max_steps:
+                    end(k, converged=stalled and settling > 0)
             if joining > 0:
                 last = {k: s.history[-1] for k, s in (done | running).items() if not s.failure and s.joined is None}
                 for k in list(running):
@@ -268,13 +265,13 @@ def batch_size(problem: FitProblem, batch: int | None, count: int) -> int:
     return min(8 if all(e.method.is_explicit for e in problem.experiments) else 1, count)
 
 
-def counted(progress: Callable[[str], None] | None, text: str, *, again: bool = True) -> Callable[[int, int], None]:
-    """Progress of many in lines, of a text such as "{} of {} searches are done": each time, or whenever more are."""
+def counted(progress: Callable[[str], None] | None, text: str) -> Callable[[int, int], None]:
+    """Progress of many in lines, of a text such as "{} of {} searches are done", whenever more are."""
     told = 0
 
     def say(done: int, count: int) -> None:
         nonlocal told
-        if progress is not None and (again or done > told):
+        if progress is not None and done > told:
             told = done
             progress(text.format(done, count))
 
@@ -327,4 +324,3 @@ _jacobian = eqx.filter_jit(lambda problem, z, sigmas: problem.jacobian(z, sigmas
 
 NO_DERIVATIVE = "there is no derivative"
 _MOVES = 3  # how many moves must have lowered the cost by little
-_ITERATIONS = 6  # how many iterations must have lowered the cost by little

@@ -33,8 +33,8 @@ class Starts(eqx.Module):
     where that search comes to no minimum.
 
     A search within a hundredth, in each coordinate, of another with a lower cost is ended, and counted where that one
-    ends; one whose sum of squares three moves, or six iterations, have lowered by less than a hundredth is ended as at
-    a minimum. Those within twice the least sum of squares are searched on, and the best is then fitted.
+    ends; one whose sum of squares three moves have lowered by less than a hundredth, or that goes no further, is ended
+    as at a minimum. Those within twice the least sum of squares are searched on, and the best is then fitted.
 
     Two ended at one minimum where their coordinates differ by less than two hundredths, or the misfit hides that:
     Δᵀ JᵀJ Δ ≤ n s² of n coordinates, with J and s² = Σ r²/(m − n) of the better one, s² at least one where σ is given.
@@ -135,7 +135,7 @@ def look_around(
     apart, size = len(points) - len(shares), batch_size(problem, starts.batch, len(points))
     costs = np.zeros(len(points))
     if starts.fraction < 1:
-        told = counted(progress, "{} of {} simulations are done", again=False)
+        told = counted(progress, "{} of {} simulations are done")
         costs = costs_at(problem, points, sigmas, size, told)
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
     # A program that makes one iteration is compiled already.
@@ -152,7 +152,7 @@ def look_around(
         chosen = sorted(set(stands) - {-1, *members}, key=lambda k: (k >= apart, costs[k]))
         if not chosen:
             break
-        told = counted(progress, "{} of {} searches are done", again=False)
+        told = counted(progress, "{} of {} searches are done")
         from_there = {k: points[k] for k in chosen}
         members = together(from_there, joining=_JOINED, settling=_SETTLED, progress=told, done=members, enough=enough)
         if any(m.interrupted or enough(m) for m in members.values()):

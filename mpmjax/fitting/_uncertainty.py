@@ -109,17 +109,17 @@ def quantile(level: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray
 
 
 def uncertainty(
-    J: np.ndarray, eps: float, noises: Sequence[tuple[slice, float, float]], moved: np.ndarray | str | None = None
+    J: np.ndarray, eps: float, noises: Sequence[tuple[slice, float, float]], moved: np.ndarray | None = None
 ) -> Uncertainty:
     """The uncertainty of the coordinates by J, the derivative of residuals in units of their noise, shape (m, n), of
     precision `eps`. `noises` are of each observation its rows, the factor by which the variance of its residuals is
     larger than one, and the degrees of freedom with which that is known: with factors c_k it is the covariance
     (JᵀJ)⁻¹ Σ c_k J_kᵀJ_k (JᵀJ)⁻¹ (H. White, Econometrica 48 (1980) 817, doi 10.2307/1912934).
 
-    `moved` is how far the minimum moves on twice the spacing, and then with twice the step, each Δ of shape (n,). The
-    covariance then has Σ Δ Δᵀ/4 besides: the 95 % interval of the grid convergence index, two grids and the order two,
-    reaches 3 |Δ|/(2² − 1) to each side (P. J. Roache, J. Fluids Eng. 116 (1994) 405, doi 10.1115/1.2910291). Of the
-    step, whose order is one, |Δ| is the error itself."""
+    `moved` has errors Δ, shape (k, n): how far the minimum moves on twice the spacing, and then with twice the step,
+    and the step that a search left undone. The covariance then has Σ Δ Δᵀ/4 besides: the 95 % interval of the grid
+    convergence index, two grids and the order two, reaches 3 |Δ|/(2² − 1) to each side (P. J. Roache, J. Fluids Eng.
+    116 (1994) 405, doi 10.1115/1.2910291). Of steps, whose order is one, |Δ| is the error itself."""
     n = J.shape[1]
     length = np.linalg.norm(J, axis=0)
     length = np.where(length == 0, 1, length)
@@ -136,7 +136,7 @@ def uncertainty(
     inverse = inverse + sum((c - 1) * part for (_, c, _), part in zip(noises, parts, strict=True))
     parts = tuple(c * part for (_, c, _), part in zip(noises, parts, strict=True))
     freedoms = tuple(freedom for *_, freedom in noises)
-    if isinstance(moved, np.ndarray):
+    if moved is not None:
         part = moved.T @ moved / _COVERAGE**2
         inverse, parts, freedoms = inverse + part, (*parts, part), (*freedoms, np.inf)
     unseen, weak = (a / np.maximum(np.linalg.norm(a, axis=0), np.finfo(float).tiny) for a in (unseen, weak))
