@@ -18,6 +18,7 @@ have the axes of F, ∇u[a, b] = ∂u_a/∂x_b; `slopes`, which sums give and ta
 that each is one more row of a sum: slopes[b, a] = ∂u_a/∂x_b.
 """
 
+import math
 from typing import TYPE_CHECKING, Annotated
 
 import jax.numpy as jnp
@@ -42,7 +43,7 @@ else:  # aliases with names, which signatures show in place of their members
     """A point or vector of d numbers."""
 
 
-MAY_BE_INFINITE = object()
+MAY_BE_INFINITE = math.inf
 """A mark of annotations: the numbers may be infinite. Without it those in files must be finite."""
 
 Corner = Annotated[Point, MAY_BE_INFINITE]

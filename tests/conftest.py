@@ -45,11 +45,17 @@ if jax.__version_info__ < (0, 11):  # later ones end at a flag that they do not 
     QUICK_TO_COMPILE.append("--xla_cpu_use_fusion_emitters=false")
 
 
+def pytest_sessionfinish() -> None:
+    """At its end pytest looks for cycles several times, a second each in what compiled programs are made of."""
+    gc.freeze()
+
+
 def pytest_runtest_teardown(item: Any, nextitem: Any) -> None:
-    """Drop compiled programs that no later test shares, or that are too many. Each holds memory maps, of which a
-    process may have 65530, and XLA crashes when there are no more."""
-    leaves = nextitem is None or nextitem.module is not item.module
-    if leaves or item.get_closest_marker("slow") or (item.get_closest_marker("thorough") and _maps() > MOST_MAPS):
+    """Drop compiled programs that no later test shares, or that are too many. Modules share operations outside of
+    programs and some scenes, a tenth of the default run's time. Each program holds memory maps, of which a process may
+    have 65530, and XLA crashes when there are no more."""
+    leaves = nextitem is not None and nextitem.module is not item.module
+    if item.get_closest_marker("slow") or _maps() > (MAPS_PASSED_ON if leaves else MOST_MAPS):
         jax.clear_caches()
 
 
@@ -61,6 +67,8 @@ def _maps() -> int:
 
 MOST_MAPS = 30_000
 """Memory maps up to which a module's programs are kept."""
+MAPS_PASSED_ON = 8_000
+"""Up to which the next module has them too: some 3 GB of memory."""
 
 
 @pytest.fixture

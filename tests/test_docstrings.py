@@ -85,3 +85,11 @@ def test_variables_are_named_for_what_they_are(name):
     nodes = list(ast.walk(FILES[name]))
     bound = {node.id for node in nodes if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load)}
     assert not (bound | {node.arg for node in nodes if isinstance(node, ast.arg)}) & NAMELESS
+
+
+def test_signatures_are_words():
+    """Help on what is public shows no object by its address in memory."""
+    for name in dir(mpmjax):
+        value = getattr(mpmjax, name)
+        if inspect.isclass(value) or inspect.isfunction(value):
+            assert " at 0x" not in str(inspect.signature(value)), name

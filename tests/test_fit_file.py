@@ -309,6 +309,8 @@ FAULTS = {
         't1 = 0.048\noptimiser = "Newton"',
         r"optimiser: .* 'Newton'\. It must be one of Adam, LBFGS, Lev",
     ),
+    "starts": ("t1 = 0.048", 't1 = 0.048\nstarts = "many"', r"starts must be a whole number or 'auto', got 'many'"),
+    "parameter": ('unit = "Pa"', 'kind = "Negative"', r"kind must be 'Positive' or .* or 'Spin', got 'Negative'"),
     "tolerance": ("t1 = 0.048", 't1 = 0.048\noptimiser = { kind = "LevenbergMarquardt", rtol = -1.0 }', r"rtol"),
     "path and kind": ('unit = "Pa"', 'kind = "Velocity"', r"takes no path"),
     "no path": ('path = "scene.material.youngs_modulus"', "", r"needs a path"),

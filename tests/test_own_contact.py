@@ -156,8 +156,8 @@ def test_what_hangs_has_a_derivative(method):
         return mpm.simulate(scene, particles, t1=0.01, dt=5e-4, method=method).final.x.mean()
 
     E = 1e5
-    difference = (height(1.001 * E) - height(0.999 * E)) / (2e-3 * E)
-    assert float(jax.grad(height)(E)) == pytest.approx(float(difference), rel=1e-5)
+    (_, slope), (above, _), (below, _) = map(jax.value_and_grad(height), (E, 1.001 * E, 0.999 * E))
+    assert float(slope) == pytest.approx(float(above - below) / (2e-3 * E), rel=1e-5)
 
 
 def test_it_is_saved_and_loaded(tmp_path):

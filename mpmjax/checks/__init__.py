@@ -13,6 +13,7 @@ from mpmjax.checks._kinds import (
     shape_of as shape_of,
 )
 from mpmjax.checks._values import (
+    Mark as Mark,
     as_floats as as_floats,
     as_plain as as_plain,
     between as between,

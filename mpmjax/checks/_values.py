@@ -11,7 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -196,18 +196,33 @@ def require_between(name: str, value: Any, lower: float | int, upper: float | in
     require_that(f"{name} must be {words}", inside, value)
 
 
-finite, positive, tolerance = require_finite, require_positive, require_tolerance
-"""Marks of annotations, see `require_fields`, as those of the two functions below."""
+@dataclass(frozen=True)
+class Mark:
+    """A condition in an annotation (see `require_fields`), which signatures show by its words."""
+
+    words: str  # what must hold
+    check: Callable[[str, Any], object]  # raises a ValueError for a name and a value that does not meet it
+
+    def __call__(self, name: str, value: Any) -> None:
+        self.check(name, value)
+
+    def __repr__(self) -> str:
+        return self.words
 
 
-def between(lower: float | int, upper: float | int, *, open_ends: bool = False) -> Callable[[str, Any], None]:
+finite, positive = Mark("finite", require_finite), Mark("positive", require_positive)
+tolerance = Mark("a relative tolerance", require_tolerance)
+
+
+def between(lower: float | int, upper: float | int, *, open_ends: bool = False) -> Mark:
     """The mark of numbers that `require_between` takes."""
-    return partial(require_between, lower=lower, upper=upper, open_ends=open_ends)
+    words = f"strictly between {lower} and {upper}" if open_ends else f"from {lower} to {upper}"
+    return Mark(words, partial(require_between, lower=lower, upper=upper, open_ends=open_ends))
 
 
-def whole(least: int) -> Callable[[str, Any], int]:
+def whole(least: int) -> Mark:
     """The mark of numbers that `require_whole` takes."""
-    return partial(require_whole, least=least)
+    return Mark(f"at least {least}", partial(require_whole, least=least))
 
 
 def canonical(tree: Any, dtype: Any) -> Any:

@@ -195,9 +195,6 @@ def fit_parameter(
 ) -> tuple[str, AbstractParameter]:
     """Name and parameter of a [[fit.parameter]] table, of these experiments."""
     where = f"[[fit.parameter]] {path or kind!r}"
-    require(
-        kind in ("Positive", "Bounded", "Unbounded", *_OF_THE_BODY), f"{where}: there is no kind of parameter {kind!r}."
-    )
     numbers = (0,) if only is None else only
     there = len(numbers) > 0 and all(0 <= k < len(experiments) for k in numbers)
     require(there, f"{where}: only must name experiments from 0 to {len(experiments) - 1}, got {only}.")

@@ -310,7 +310,6 @@ def _force_displacement(
 def _energy(
     m: Measurement, *, value: str, part: Literal["kinetic", "elastic", "potential", "total"] = "total"
 ) -> Series:
-    require(part in ("kinetic", "elastic", "potential", "total"), f"{_HEADER} Energy has no part {part!r}.")
     columns = m.columns(m.time, value)
     return Series(m.times(columns), m.scaled(columns, value), _EnergyPart(part), **m.named(f"{part} energy [J]"))
 

@@ -2,10 +2,11 @@
 
 import itertools
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,21 +31,18 @@ class RunSettings(eqx.Module):
     dt: Scalar | str | None = None  # step [s], or "stable"; None for "auto"
     method: AbstractIntegrator | None = None  # None for "auto"
     save_every: int | None = None  # steps from frame to frame; None if the file does not say
-    precision: str | None = None  # None for JAX's own, in the shell float64
+    precision: Literal["float32", "float64"] | None = None  # None for JAX's own, in the shell float64
     error: float = eqx.field(converter=float, default=1e-2)  # relative error that "auto" aims at
     most_seconds: float = eqx.field(converter=float, default=60.0)  # seconds that its pilot runs may take
 
     def __check_init__(self):
-        require_positive("[run] t1", self.t1)
         if isinstance(self.dt, str):
             require(self.dt == "stable", f'[run] dt must be a step in seconds, "stable" or "auto", got {self.dt!r}.')
         elif self.dt is not None:
             require_positive("[run] dt", self.dt)
-        require_positive("[run] error", self.error)
-        require_positive("[run] most_seconds", self.most_seconds)
+        for name in ("t1", "error", "most_seconds"):
+            require_positive(f"[run] {name}", getattr(self, name))
         every = self.save_every is None or self.save_every >= 1
-        is_dtype = self.precision in ("float32", "float64", None)
-        require(is_dtype, f'[run] precision must be "float32" or "float64", got {self.precision!r}.')
         double = jnp.result_type(float) == jnp.float64 or self.precision != "float64"
         require(double, '[run] precision = "float64" needs jax.config.update("jax_enable_x64", True) first.')
         require(every, f"[run] save_every must be at least 1, got {self.save_every}.")
@@ -127,11 +125,15 @@ def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
                 require(len(groups) == 1, "[particles] file has all particles of a scene: make it the only table.")
                 require(n == 1, "[particles] file: particles from a file cannot be refined, give them a region.")
                 particles = particles_in(**arguments(particles_in, groups[0], "[particles]"))
-                particles = canonical(particles, run.precision or particles.x.dtype)
+                particles, overlap = canonical(particles, run.precision or particles.x.dtype), False
             else:
-                particles = _filled(scene, groups, run.precision)
+                particles, overlap = _filled(scene, groups, run.precision)
             scene = attach(scene, particles)
-            return scene, prepare(scene, particles)
+            if not overlap:
+                return scene, prepare(scene, particles)
+            with warnings.catch_warnings():  # of the overlap `_filled` has told, with the numbers of the tables
+                warnings.filterwarnings("ignore", "Near .* particles take")
+                return scene, prepare(scene, particles)
 
         scene, particles = build(1)
         if run.dt is not None and not isinstance(run.dt, str):
@@ -229,8 +231,9 @@ def _lists(material: Any) -> list[str]:
     return [key for key, value in items if isinstance(value, list)] + [k for _, v in items for k in _lists(v)]
 
 
-def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
-    """The particles of all tables, those of each material together, in the materials' order."""
+def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> tuple[Particles, bool]:
+    """The particles of all tables, those of each material together, in the materials' order, and whether tables
+    overlap, with a warning."""
     filled: list[list[Particles]] = [[] for _ in scene.laws]
     placed: list[tuple[int, AbstractRegion, np.ndarray]] = []
     grid, dx = scene.grid, float(scene.grid.spacing)
@@ -264,12 +267,14 @@ def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
             placed.append((number, region, np.asarray(filled[material - 1][-1].x)))
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
+    overlap = False
     for (i, region, _), (j, _, x) in itertools.combinations(placed, 2):
         lower, upper = region.bounds()
         if ((x.min(axis=0) >= upper) | (x.max(axis=0) <= lower)).any():
             continue
         inside = int(np.asarray(region.contains(jnp.asarray(x), -1e-3 * dx)).sum())  # deeper than rounding has it
         if inside:
+            overlap = True
             warn(
                 f"{inside} particles of [[particles]] {j} lie in the region of [[particles]] {i}: where two fill the "
                 "same place there is twice the mass."
@@ -277,4 +282,4 @@ def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> Particles:
     for number, sets in enumerate(filled):
         place = f"[material.{scene.names[number]}]" if scene.names else f"[[material]] {number + 1}"
         require(len(sets) > 0, f"{place} has no particles: name it in a [[particles]] table, or leave it out.")
-    return join(*(replace(join(*sets), counts=None) for sets in filled))
+    return join(*(replace(join(*sets), counts=None) for sets in filled)), overlap

@@ -3,14 +3,14 @@
 import enum
 import inspect
 from collections.abc import Callable, Iterable
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, get_args, get_origin
 
 from mpmjax.checks import alternatives, is_class
 from mpmjax.cli._fit_file import fit_parameter, fit_settings
 from mpmjax.cli._measurements import KINDS, keys_of
 from mpmjax.cli._scene_file import RunSettings, particles_in
 from mpmjax.fitting import AbstractOptimiser
-from mpmjax.io import MADE, classes_for, forms_of, known_classes, parameters_of, save
+from mpmjax.io import MADE, classes_for, forms_of, known_classes, parameters_of, save, words_of
 from mpmjax.state import Scene, fill
 
 
@@ -60,7 +60,7 @@ def _table(function: Callable, without: Iterable[str] = (), kind: str | None = N
 def _value(hint: Any) -> dict[str, Any]:
     """The JSON schema of what an annotation takes."""
     json, options = {float: "number", int: "integer", bool: "boolean", str: "string"}, alternatives(hint)
-    words = [word for a in options if get_origin(a) is Literal for word in get_args(a)]
+    words = words_of(hint)
     choices: list[dict[str, Any]] = [{"enum": words}] if words else []
     for kind, depth in sorted(forms_of(hint), key=str):
         if words and (kind, depth) == (str, 0):

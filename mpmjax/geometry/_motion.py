@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Point, Scalar
-from mpmjax.checks import coordinates, require, require_fields, require_finite, require_that, shape_of
+from mpmjax.checks import Mark, coordinates, require, require_fields, require_finite, require_that, shape_of
 
 Times = Float[Array, "j"] | Float[np.ndarray, "j"] | tuple[float | int | Array, ...] | list[float | int | Array]
 Displacements = Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
@@ -259,6 +259,7 @@ def value_at(value: Changing | ChangingVector, t: Scalar) -> Float[Array, "..."]
     return value.at(t) if isinstance(value, TimeSeries) else jnp.asarray(value)
 
 
+@partial(Mark, "finite numbers, one at least")
 def require_some(name: str, value: Changing | ChangingVector) -> None:
     """Check that a value has numbers, and finite ones; a series has been checked.
 

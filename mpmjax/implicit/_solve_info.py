@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, Bool, Float, Int
-from mpmjax.checks import require_that
+from mpmjax.checks import Mark, require_that
 
 _COUNT = partial(jnp.zeros, (), jnp.int32)
 
@@ -68,6 +68,7 @@ class AbstractInnerProductSolver(lx.AbstractLinearSolver[Any]):
     """
 
 
+@partial(Mark, "with an atol above zero")
 def require_solver(name: str, solver: lx.AbstractLinearSolver) -> None:
     """Check a linear solver: a ValueError if it has an absolute tolerance that is not above zero."""
     if (atol := getattr(solver, "atol", None)) is not None:

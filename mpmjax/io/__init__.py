@@ -14,6 +14,7 @@ from mpmjax.io._schema import (
     parameters_of as parameters_of,
     register as register,
     require_keys as require_keys,
+    words_of as words_of,
 )
 from mpmjax.io._transactional_file import (
     ReplacedFile as ReplacedFile,

@@ -119,6 +119,7 @@ def record(
     if resume:
         writer = FrameWriter.resume(path, problem)
     else:
+        eqx.filter_eval_shape(problem.controlled, initial_state(problem), 0.0)  # else what it refuses leaves a file
         writer = FrameWriter.create(path, problem, fields, start=start, overwrite=overwrite)
     with writer:
         step, state, statistics = writer.last()

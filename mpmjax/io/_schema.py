@@ -226,8 +226,7 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
             raise ValueError(f"{where}: {error}" if where else str(error)) from None
     if enums := [a for a in options if is_class(a, enum.Enum)]:
         words = [member.value for member in enums[0]]
-        listed = ", ".join(map(repr, words))
-        _require(isinstance(data, str) and data in words, where, f"must be one of {listed}, got {_short(data)}")
+        _require(data in words, where, f"must be one of {', '.join(map(repr, words))}, got {_short(data)}")
         return enums[0](data)
     return _numbers(data, expected, where, arrays)
 
@@ -314,16 +313,17 @@ def require_keys(table: dict[str, Any], names: Iterable[str], where: str) -> Non
 
 def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray] | None) -> Any:
     """Numbers, words and switches, single or in (nested) lists."""
-    forms = forms_of(expected)
+    forms, words = forms_of(expected), words_of(expected)
+    must_be = f"must be {_in_words(forms, words)}, got"
     if isinstance(data, dict) and set(data) == {"array"} and arrays is not None:
         _require(data["array"] in arrays, where, f"refers to the array {data['array']!r}, which is not there")
         a = arrays[data["array"]]
-        _require((float, a.ndim) in forms, where, f"must be {_words(forms)}, got an array of shape {a.shape}")
+        _require((float, a.ndim) in forms, where, f"{must_be} an array of shape {a.shape}")
         kinds = {float}
     else:
         a = np.array(data, dtype=object)  # where lists are ragged, an array of lists
         kinds = {kind for kind, depth in forms if depth == a.ndim and all(_fits(leaf, kind) for leaf in a.flat)}
-        _require(kinds, where, f"must be {_words(forms)}, got {_short(data)}")
+        _require(kinds - {str} if words and data not in words else kinds, where, f"{must_be} {_short(data)}")
     if float in kinds:
         try:
             a = a if a.dtype.kind == "f" else a.astype(float)
@@ -381,13 +381,16 @@ def forms_of(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
     return forms
 
 
-def _words(forms: set[tuple[type, int]]) -> str:
-    def words(kind: type, depth: int) -> str:
-        lists = " ".join(["a list of", *["lists of"] * (depth - 1)])
-        return _ONE[kind] if depth == 0 else f"{lists} {_MANY[kind]}"
+def words_of(hint: Any) -> list[str]:
+    """The words that an annotation takes, if it takes some only."""
+    return [word for a in alternatives(hint) if get_origin(a) is Literal for word in get_args(a)]
 
+
+def _in_words(forms: set[tuple[type, int]], words: list[str]) -> str:
+    alone = _ONE | ({str: " or ".join(map(repr, words))} if words else {})
     whole = {(int, depth) for kind, depth in forms if kind is float}  # a number may be whole anyway
-    return " or ".join(words(kind, depth) for kind, depth in sorted(forms - whole, key=lambda form: form[1]))
+    lists = sorted(forms - whole, key=lambda form: (form[1], form[0] is str))
+    return " or ".join(f"a list of {'lists of ' * (k - 1)}{_MANY[kind]}" if k else alone[kind] for kind, k in lists)
 
 
 def _fits(leaf: Any, kind: type) -> bool:

@@ -45,7 +45,7 @@ def library() -> Library:
 
     def absence(handle: ctypes.CDLL) -> str:
         handle.mpmjax_instructions.restype = ctypes.c_char_p
-        return "" if handle.mpmjax_instructions() else "it has kernels for AVX2 and AVX-512 alone"
+        return "" if handle.mpmjax_instructions() else "it has no kernels for this processor; reinstall on it"
 
     return _loaded(PATH, absence, (*KERNELS, "threads"), "cpu")
 

@@ -118,10 +118,12 @@ class Problem(eqx.Module):
         whole = isinstance(after, tuple) and len(after) == 3 and isinstance(after[0], Scene)
         require(whole, f"A control must return (scene, particles, memory), got {shortened(str(after))}.")
         asked, new = ({"particles": q, "memory": m} for _, q, m in (before, after))
+        name = partial(jax.tree_util.keystr, simple=True, separator=".")
+        a, b = ({name(path): jnp.shape(x) for path, x in jax.tree_util.tree_leaves_with_path(t)} for t in (asked, new))
+        where = next((f": {k} has shape {b.get(k)} and had {a.get(k)}" for k in a | b if a.get(k) != b.get(k)), "")
         require(
             bool(eqx.tree_equal(jax.tree.map(jnp.shape, asked), jax.tree.map(jnp.shape, new))),
-            "A control must return particles and memory of the structure and shapes that it was given"
-            + _first_difference(asked, new),
+            f"A control must return particles and memory of the structure and shapes that it was given{where}.",
         )
         scene, particles, memory = after
         fixed = [([type(a) for a in (*s.boundary, *s.loads, *s.laws)], s.grid.shape) for s in (self.scene, scene)]
@@ -171,14 +173,6 @@ def run_to(
         final_memory=state.memory,
         **({"steps": jax.device_put(np.zeros((0,), dtype)), "observed": None} | more),
     )
-
-
-def _first_difference(asked: Any, new: Any) -> str:
-    """The end of a message that says which leaf of two trees is not alike."""
-    name = partial(jax.tree_util.keystr, simple=True, separator=".")
-    a, b = ({name(path): np.shape(x) for path, x in jax.tree_util.tree_leaves_with_path(t)} for t in (asked, new))
-    where = next((key for key in {**a, **b} if a.get(key) != b.get(key)), None)
-    return "." if where is None else f": {where} has shape {b.get(where)} and had {a.get(where)}."
 
 
 def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, Bool[Array, "p"]]:
