@@ -24,15 +24,7 @@ from mpmjax.fitting._optimiser import LBFGS, LevenbergMarquardt
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._result import FitResult, Noise, fit_result, settle_noise
-from mpmjax.fitting._search import (
-    NO_DERIVATIVE,
-    AbstractOptimiser,
-    Iteration,
-    Search,
-    batch_size,
-    counted,
-    search_many,
-)
+from mpmjax.fitting._search import NO_DERIVATIVE, AbstractOptimiser, Iteration, Search, batch_size, counted, search_many
 from mpmjax.fitting._starts import Starts, as_starts, look_around, starting_points, unit_points
 from mpmjax.fitting._uncertainty import seen_together, uncertainty
 

@@ -33,9 +33,9 @@ class LevenbergMarquardt(AbstractOptimiser):
     It ends where a step changes nothing by more than the tolerance, where the next Gauss-Newton step, no longer than to
     a bound, is less than a ten-thousandth of the standard error that the misfit gives, or where one is refused and
     could lower Σ r² by no more than its rounding, or a hundredth of the variance σ² = Σ r²/(m − n). Where six
-    iterations, half of them refused, lower it by less than a tenth of σ² and move no coordinate by more than 0.03, or
-    only steps far shorter than the Gauss-Newton step are taken, the misfit has a kink or simulations fail beyond: it
-    ends, and has not converged.
+    iterations, half of them refused, lower it by less than a tenth of σ² or a ten-thousandth, and move no coordinate by
+    more than 0.03, or only steps far shorter than the Gauss-Newton step are taken, the misfit has a kink or simulations
+    fail beyond: it ends, and has not converged.
 
     Args:
         rtol: relative and absolute tolerance of coordinates and residuals.
@@ -83,7 +83,7 @@ class LevenbergMarquardt(AbstractOptimiser):
             often = len(lately) == _LATELY and sum(not i.accepted for i in lately) >= _LATELY / 2
             near = bool((np.abs(z - lately[0].z) <= _NOWHERE).all())
             gained = 2 * lately[0].cost - min((r**2).sum(), (last**2).sum())
-            stalled = often and near and gained <= _SLOW / freedom * (last**2).sum()
+            stalled = often and near and gained <= max(_SLOW / freedom, _LITTLE**2) * (last**2).sum()
         r, J = _exact(seen)
         if not np.isfinite(J).all():
             return z, state, seen
@@ -96,11 +96,12 @@ class LevenbergMarquardt(AbstractOptimiser):
         short = (np.abs(steps) <= furthest).all(axis=0)
         step = steps[:, short.argmax() if short.any() else -1]
         wanted = np.abs(np.linalg.lstsq(J, -r)[0]).max()
-        held = wanted > _FAR * tolerance and np.abs(step).max() < _REFUSED * wanted
+        held = wanted > _FAR * tolerance and (stalled or np.abs(step).max() < _REFUSED * wanted)
+        over = settled or stalled
         if not refused and (straight := _to_a_bound(seen, step)) is not None:
             # If it is refused, damped steps go on as if it had not been tried.
             step, reach = straight, reach * _SHORTER
-        after = np.asarray(z, float) + step, reach, refused, settled and not held, stalled or (settled and held)
+        after = np.asarray(z, float) + step, reach, refused, over and not held, over and held
         kinds = (leaf.dtype for leaf in state)
         return z, DampedState(*map(jnp.asarray, after, kinds)), seen
 
