@@ -15,7 +15,7 @@ PAGE = (ROOT / "docs/parity.md").read_text(encoding="utf-8")
 HEAD, *ROWS = [[cell.strip() for cell in line.split("|")[1:-1]] for line in PAGE.splitlines() if line.startswith("| ")]
 PARITY = {row[0]: dict(zip(HEAD, row, strict=True)) for row in ROWS}
 ASKED = {
-    "reverse": r"\bgrad\(|value_and_grad\(|\bvjp\(|jacrev\(|\bfit\(|import derivatives|from derivatives",
+    "reverse": r"\bgrad\(|value_and_grad\b|\bvjp\(|jacrev\(|\bfit\(|import derivatives|from derivatives",
     "forward": r"\bjvp\(|jacfwd\(|hessian\(|ForwardMode|\bfit\(|from derivatives",
     "float32": "float32",
     "total": "TotalLagrangian|DESCRIPTIONS",
