@@ -51,11 +51,11 @@ def pytest_sessionfinish() -> None:
 
 
 def pytest_runtest_teardown(item: Any, nextitem: Any) -> None:
-    """Drop compiled programs that no later test shares, or that are too many. Modules share operations outside of
-    programs and some scenes, a tenth of the default run's time. Each program holds memory maps, of which a process may
-    have 65530, and XLA crashes when there are no more."""
-    leaves = nextitem is not None and nextitem.module is not item.module
-    if item.get_closest_marker("slow") or _maps() > (MAPS_PASSED_ON if leaves else MOST_MAPS):
+    """Drop compiled programs that no later test shares, or that are too many. Each holds memory maps, of which a
+    process may have 65530, and XLA crashes when there are no more. Kept for later modules, they took twice the memory
+    of the workers and gained nothing."""
+    leaves = nextitem is None or nextitem.module is not item.module
+    if leaves or item.get_closest_marker("slow") or (item.get_closest_marker("thorough") and _maps() > MOST_MAPS):
         jax.clear_caches()
 
 
@@ -67,8 +67,6 @@ def _maps() -> int:
 
 MOST_MAPS = 30_000
 """Memory maps up to which a module's programs are kept."""
-MAPS_PASSED_ON = 8_000
-"""Up to which the next module has them too: some 3 GB of memory."""
 
 
 @pytest.fixture

@@ -29,13 +29,9 @@ ROOT = Path(__file__).parents[1]
 SIDE = 6
 
 
-@pytest.fixture(autouse=True, scope="module")
-def as_if_nothing_were_asked():
-    jax.clear_caches()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.delenv("MPMJAX_BACKEND", raising=False)
-        yield
-    jax.clear_caches()
+@pytest.fixture(autouse=True)
+def as_if_nothing_were_asked(monkeypatch):
+    monkeypatch.delenv("MPMJAX_BACKEND", raising=False)
 
 
 def basis_for(d, s, *, side=SIDE, periodic=False):
