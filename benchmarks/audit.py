@@ -135,11 +135,15 @@ def walls() -> None:
 
 
 def askew() -> None:
-    """Water in two `SeparatingCollider`s at right angles, turned by an angle, and in a bowl, from its exact state."""
-    print("\nwater at rest, K = 40 ρgH, H cells deep, after 2 s, at so many times the explicit limit: vessel, cells;")
+    """Water in two colliders at right angles, turned by an angle, and in a bowl, from its exact state."""
+    print(
+        "\nwater at rest, K = 40 ρgH, H cells deep, after 2 s, at so many times the explicit limit: wall, vessel, cells"
+    )
     print("rms error of the pressure over the last second [% of ρgH], change of the centre's height [% of H]")
     at, dx = np.array([0.013, 0.021]), 1 / 16
-    for kind, cells, times in ((k, n, s) for k in (20.0, 37.0, "bowl") for n in (8, 16) for s in (0.7, 9.0)):
+    cases = [(mpm.SeparatingCollider, k, n, s) for k in (20.0, 37.0, "bowl") for n in (8, 16) for s in (0.7, 9.0)]
+    cases += [(wall, k, 8, 0.7) for wall in (mpm.SlipCollider, mpm.StickyCollider) for k in (20.0, 37.0, "bowl")]
+    for wall, kind, cells, times in cases:
         deep = cells * dx
         if isinstance(kind, str):
             ball = mpm.Ball((at[0], deep), deep)
@@ -155,7 +159,8 @@ def askew() -> None:
             outside = map(mpm.geometry.Complement, shapes)
             inside = mpm.geometry.Intersection((*outside, mpm.Box((-reach, -0.1), (reach, top))))
         lower, upper = (np.floor(np.asarray(corner) / dx).astype(int) for corner in inside.bounds())
-        grid = mpm.Grid(tuple(upper - lower + 10), dx, origin=tuple(lower - 4))
+        room = 4 if wall is mpm.SeparatingCollider else 30  # for what sinks and is thrown up
+        grid = mpm.Grid(tuple(upper - lower + 2 * room + 2), dx, origin=tuple(lower - room))
         law, water = mpm.Fluid(40 * WATER * G * deep), mpm.fill(inside, grid, density=WATER)
         F, history = squeezed(law, np.asarray(WATER * G * (top - water.x[:, 1])))
         part, volume = water.volume / water.volume.sum(), water.volume / F
@@ -169,14 +174,16 @@ def askew() -> None:
 
         dt = times * float(mpm.stable_dt(mpm.Scene(grid, law), water, safety=1.0))
         method, steps = mpm.Explicit() if times < 1 else mpm.SemiImplicit(), round(2.0 / dt)
-        scene = mpm.Scene(grid, law, gravity=(0.0, -G), boundary=tuple(map(mpm.SeparatingCollider, shapes)))
+        scene = mpm.Scene(grid, law, gravity=(0.0, -G), boundary=tuple(map(wall, shapes)))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             run = mpm.simulate(scene, water, t1=steps * dt, dt=dt, method=method, observe=observe)
         error, height = map(np.asarray, run.observed)
         rise = 100 * float(height[-1] - part @ water.x[:, 1]) / deep
         print(
-            f"{kind:>5} {cells:3d} {times:4.1f} | {100 * np.sqrt((error[-steps // 2 :] ** 2).mean()):6.2f} {rise:7.3f}"
+            f"{wall.__name__:18} {kind:>5} {cells:3d} {times:4.1f} | "
+            f"{100 * np.sqrt((error[-steps // 2 :] ** 2).mean()):6.2f} {rise:7.3f}",
+            flush=True,
         )
 
 

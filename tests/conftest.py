@@ -52,8 +52,8 @@ def pytest_sessionfinish() -> None:
 
 def pytest_runtest_teardown(item: Any, nextitem: Any) -> None:
     """Drop compiled programs that no later test shares, or that are too many. Each holds memory maps, of which a
-    process may have 65530, and XLA crashes when there are no more. Kept for later modules, they took twice the memory
-    of the workers and gained nothing."""
+    process may have 65530, and XLA crashes when there are no more. Kept for later modules, they took 10 GB
+    and gained nothing."""
     leaves = nextitem is None or nextitem.module is not item.module
     if leaves or item.get_closest_marker("slow") or (item.get_closest_marker("thorough") and _maps() > MOST_MAPS):
         jax.clear_caches()
