@@ -157,7 +157,8 @@ def fit(
     if not result.converged:
         stopped = "was interrupted" if result.interrupted else "did not converge"
         advice = " Raise max_steps, start closer, or give a rtol that the precision can reach."
-        advice *= not result.interrupted and not optimiser.has_stalled(end.inner)
+        if result.interrupted or optimiser.has_stalled(end.inner):
+            advice = ""
         warn(f"The fit {stopped} after {len(result.history)} iterations: its errors hold only at a minimum.{advice}")
     elif changing:
         warn(f"The noise of the observations did not settle in {MOST_ROUNDS} rounds: give the sigma of one of them.")
