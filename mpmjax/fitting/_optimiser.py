@@ -130,7 +130,7 @@ class _Lines(NamedTuple):
 
     @classmethod
     def at(cls, seen: Evaluation) -> "_Lines":
-        """Those at a place."""
+        """Lines at a place."""
         return cls(*(np.asarray(a, float) for a in (seen.residuals, seen.jacobian, seen.room)))
 
     @property
