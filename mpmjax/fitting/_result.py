@@ -367,7 +367,8 @@ def intervals(
 _MOST_ROWS = 12  # numbers of one parameter up to which each has a row of the table
 _SHAPES = {
     "a ramp": "show a ramp: look at the drift and the zero of what measured, and at loads and the start of the run",
-    "drifts": "drift: look at the law, at its damping, and for another minimum",
+    "drifts": "drift: look at law and damping, for another minimum, and at what was taken as known and may be fitted: "
+    "place and friction of a wall, velocity at the start, scale of a picture",
     "correlated": "are correlated: look at their picture, for a motion that law or grid miss, or smoothed data",
 }
 _EXACT = 1e-6  # misfit, in sizes of the data, below which data are exact

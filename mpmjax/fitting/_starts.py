@@ -138,6 +138,13 @@ def look_around(
         told = counted(progress, "{} of {} simulations are done")
         costs = costs_at(problem, points, sigmas, size, told)
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
+    remark = ""
+    if 2 * len(failures) > len(points):
+        try:
+            problem.explain(jnp.asarray(points[min(failures)], problem.dtype), _FAILS)
+        except (ValueError, RuntimeError) as cause:
+            failures[min(failures)] = str(cause)
+            remark = f"{len(failures)} of {len(points)} starts failed, the first since: {cause}"
     # A program that makes one iteration is compiled already.
     size = 1 if starts.if_needed and starts.batch is None else size
     together = partial(search_many, [(problem, sigmas)], optimiser, batch=size)
@@ -176,7 +183,7 @@ def look_around(
         )
         for end, numbers in groups
     )
-    ended, remark = {k for _, numbers in groups for k in numbers}, ""
+    ended = {k for _, numbers in groups for k in numbers}
     if minima and minima[0].searches == 1 and len(ended & members.keys()) > 1 and not starts.if_needed:
         remark = (
             f"The best minimum was found by one search of {len(members)}: there may be a better one. Take more starts, "
