@@ -18,7 +18,7 @@ from mpmjax.checks import checked, positive, require, warn
 from mpmjax.fitting._estimate import VALUE, AbstractFit, Estimate, NoiseEstimate, table
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import Level, chosen_optimiser, fit, require_end
-from mpmjax.fitting._observation import Series
+from mpmjax.fitting._observation import AbstractTimed
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import FitResult
@@ -146,7 +146,7 @@ def _first_horizon(problem: FitProblem, z: Coordinates) -> float:
     if not np.isfinite(r).all():
         problem.explain(z)
     for o, rows, sigma in zip(problem.observations, problem.rows, sigmas, strict=True):
-        if isinstance(o, Series):
+        if isinstance(o, AbstractTimed):
             change = (J[rows] ** 2).reshape(len(o.times), -1, problem.size).sum(axis=1)
             data = o.data.reshape(len(o.times), -1)
             measured, spread = np.isfinite(data), np.broadcast_to(np.asarray(sigma), o.data.shape).reshape(data.shape)
