@@ -104,18 +104,15 @@ class AbstractTimed(_Measured):
     def against(self) -> tuple[str, np.ndarray]:
         return "time [s]", self.times
 
-    def predict(self, seen: Any, run: Run) -> Array:
-        return self._at_times(seen, run)
-
-    def _at_times(self, values: Array, run: Run, first: Scalar = 0.0) -> Array:
-        """Values at the times, from those of all steps, shape (k, ...), the first of which is `first` steps from the
-        start; NaN at times that a parameter has moved out of the run."""
-        step = jnp.asarray(self.times, values.dtype) / run.dt
+    def predict(self, seen: Any, run: Run, first: Scalar = 0.0) -> Array:
+        """Values at the times, from those `seen` of all steps, shape (k, ...), the first of which is `first` steps from
+        the start; NaN at times that a parameter has moved out of the run."""
+        step = jnp.asarray(self.times, seen.dtype) / run.dt
         outside = (step < -_BEYOND) | (step > (len(run.steps) - 1) * (1 + ROUNDED) + _BEYOND)
-        outside = outside.reshape(-1, *[1] * (values.ndim - 1))
-        return jnp.where(outside, jnp.nan, between(values, step - first))
+        outside = outside.reshape(-1, *[1] * (seen.ndim - 1))
+        return jnp.where(outside, jnp.nan, between(seen, step - first))
 
-    def _check_times(self, t1: float) -> None:
+    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         outside = (self.times < 0) | after(self.times, t1)
         require(
             ~outside,
@@ -159,7 +156,7 @@ class Series(AbstractTimed):
         return self.of(scene, particles)
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
-        self._check_times(t1)
+        super().check(scene, particles, t1)
         seen = eqx.filter_eval_shape(lambda *state: self.observe(*state), scene, particles)
         shape = getattr(seen, "shape", None)
         require(
@@ -194,7 +191,7 @@ class Tracks(AbstractTimed):
         return self.which(scene, particles)
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
-        self._check_times(t1)
+        super().check(scene, particles, t1)
         require(
             self.data.shape[2] == particles.dim,
             f"{self.title} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.",
@@ -225,7 +222,7 @@ class Force(AbstractTimed):
         return jnp.zeros((), particles.x.dtype)
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
-        self._check_times(t1)  # the forces' shape is checked when they are predicted
+        super().check(scene, particles, t1)  # the forces' shape is checked when they are predicted
         kind, number, count = "collider", self.collider, scene.collider_count
         if self.boundary is not None:
             kind, number, count = "boundary", self.boundary, len(scene.boundary) + len(scene.guides)
@@ -236,9 +233,9 @@ class Force(AbstractTimed):
             "boundary_forces=True.",
         )
 
-    def predict(self, seen: Any, run: Run) -> Array:
+    def predict(self, seen: Any, run: Run, first: Scalar = 0.0) -> Array:
         at = run.method.force_at()
-        return self._at_times(self._simulated(run), run, 0.0 if at is None else at)
+        return super().predict(self._simulated(run), run, first if at is None else at)
 
     def explain(self, seen: Any, run: Run) -> None:
         super().explain(self._simulated(run), run)
