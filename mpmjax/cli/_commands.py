@@ -19,13 +19,13 @@ from mpmjax.analysis import METHODS, Trial, energy, grid_mass, name_of, pieces, 
 from mpmjax.checks import require, warn
 from mpmjax.cli._fit_file import FitFile, read_fit, refinements
 from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
-from mpmjax.fitting import Experiment, FitProblem, Profile, fit, fit_refined, fit_staged, predict_observations, profile
+from mpmjax.fitting import Experiment, FitProblem, Profile, fit, fit_refined, fit_staged, profile
 from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, replacing, reporting, standing_in, stopping, table
 from mpmjax.native import BACKENDS, backend
 from mpmjax.simulation import Problem, Run, SimulationError, initial_state, no_steps, run_to
 from mpmjax.state import Particles
 from mpmjax.stepping import Explicit, stable_dt, step
-from mpmjax.viz import draw_chart, draw_fit, render, write_fit, write_trials
+from mpmjax.viz import draw_chart, render, write_fit, write_trials
 
 
 def run_scene(
@@ -251,9 +251,7 @@ def fit_scene(
     if not result.interrupted:
         result.warn_of_runs()
     print(f"{iterations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all", flush=True)
-    report = whole, tuple(drawn), predict_observations(result, whole)
-    numbers = write_fit(outcome, plot.with_suffix(".json"), *report)
-    print(f"written {draw_fit(result, plot, *report)} and {numbers}")
+    print(f"written {plot} and {write_fit(outcome, plot, whole, tuple(drawn))}")
     if stop.signal or result.interrupted:
         sys.exit(128 + (stop.signal or signal.SIGINT))
 

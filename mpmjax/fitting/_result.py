@@ -280,13 +280,11 @@ def fit_result(
         def value(z: Coordinates, of: Callable[[Experiment], Any] = of) -> Array:
             return jnp.asarray(of(problem.at(z)[0]))
 
-        number, start, both = float(value(z)), float(value(jnp.zeros_like(z))), []
-        for each in (errors, noise_alone):
-            error, freedom = each.of(np.asarray(jax.jacfwd(value)(z), float))
-            both.append((float(error), float(quantile(level, freedom) * error)))
-        reach = max(by for _, by in both), both[1][1]
-        ends, alone = ((number - by, number + by) for by in reach)
-        reported.append(Estimate(name, number, both[0][0], ends, "", start, False, both[1][0], alone))
+        number, start, along = float(value(z)), float(value(jnp.zeros_like(z))), jax.jacfwd(value)(z)
+        whole, alone = (banded(each, level, number, along) for each in (errors, noise_alone))
+        ends = float(min(whole.lower, alone.lower)), float(max(whole.upper, alone.upper))
+        by_noise = float(alone.error), (float(alone.lower), float(alone.upper))
+        reported.append(Estimate(name, number, float(whole.error), ends, "", start, False, *by_noise))
     degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
     texts = seen_together(problem.labels, errors, problem.logarithmic)
     if isinstance(moved, str):
