@@ -125,10 +125,9 @@ def fit(
 
         def enough(other: Search) -> bool:
             """Whether a search is at a lower minimum, which the noise explains."""
-            ended = not other.failure and other.converged and other.joined is None
-            if not (starts.if_needed and ended) or other.cost >= end.cost:
+            if other.failure or not other.converged or other.joined is not None or not starts.if_needed:
                 return False
-            result = resulted(other, settle_noise(problem, other, noise)[0])
+            result = None if other.cost >= end.cost else resulted(other, settle_noise(problem, other, noise)[0])
             return result is not None and not result.is_beyond
 
         ((end, settled, changing, noise),) = descend([sigmas], starts={0: zeros}, rounds=rounds, state=state)
