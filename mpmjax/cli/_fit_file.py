@@ -1,7 +1,7 @@
 """The `[fit]` table of a scene file (docs/scene_files.md): what is fitted, and what was measured."""
 
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -138,7 +138,7 @@ def _refined(simulation: Simulation, n: int) -> Simulation:
     if n == 1:
         return simulation
     scene, particles = simulation.build(n)
-    return simulation._replace(scene=scene, particles=particles, dt=simulation.dt / n)
+    return replace(simulation, scene=scene, particles=particles, dt=simulation.dt / n)
 
 
 def leaf_of(path: str, experiment: Experiment) -> Any:

@@ -162,7 +162,7 @@ def _shown(made: Any, m: Measurement, keys: dict[str, Any]) -> Any:
     if key is None or "grid" in keys:  # a picture
         return made
     heads = (keys[key],) if isinstance(keys[key], str) else keys[key]
-    si = _SI.get(key, "m" if isinstance(made.of, Extent) else "J")
+    si = _SI.get(key, "m" if isinstance(getattr(made, "of", None), Extent) else "J")
 
     def named(head: str, factor: float, of: str) -> str:
         unit = of if factor == 1 else f"{factor:g} {of}"

@@ -4,9 +4,9 @@ import itertools
 import os
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -55,30 +55,27 @@ class RunSettings(eqx.Module):
         require(double, '[run] precision = "float64" needs jax.config.update("jax_enable_x64", True) first.')
 
 
-class SceneFile(NamedTuple):
+@dataclass(frozen=True)
+class SceneFile:
     """A scene file as it was read: "auto" and "stable" are left to be resolved."""
 
     scene: Scene
     particles: Particles
     run: RunSettings
-    output: dict[str, Any]
-    fit: dict[str, Any] | None
-    build: Build
+    output: dict[str, Any]  # the `[output]` table, as arguments of `record` and `save`
+    fit: dict[str, Any] | None  # the `[fit]` table, not read yet; None without one
+    build: Build  # makes the scene and its particles on n times as many cells a direction, from n
 
 
-class Simulation(NamedTuple):
+@dataclass(frozen=True)
+class Simulation(SceneFile):
     """A scene file with its step and method resolved, ready to be run."""
 
-    scene: Scene
-    particles: Particles
     t1: float
     dt: float
     method: AbstractIntegrator
     save_every: int
-    output: dict[str, Any]  # the `[output]` table, as arguments of `record` and `save`
-    fit: dict[str, Any] | None  # the `[fit]` table, not read yet; None without one
     choice: str | None  # the choice for "auto" or "stable", and why; None if there was none
-    build: Build  # makes the scene and its particles on n times as many cells a direction, from n
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -164,13 +161,12 @@ def read_simulation(
     "auto", within `most_seconds` or what the file says. `progress` and `say` are those of `work_precision`."""
     file = read_scene_file(path, changes)
     run, choice = file.run, None
-    t1, dt, method, save_every = run.t1, run.dt, run.method, run.save_every
+    t1, dt, method, save_every = run.t1, step_of(path, file), run.method, run.save_every
     require(
         most_seconds is None or dt is None or method is None,
         "--most-seconds is for pilot runs, and there are none: the file gives dt and method.",
     )
-    if dt == "stable":
-        dt = stable_step(path, file)
+    if dt is not None and run.dt == "stable":
         steps = round(t1 / dt)
         choice = f"dt = {dt:.6g} s ({steps} steps), the longest that is stable as the particles start"
         save_every = save_every or max(1, steps // _FRAMES)
@@ -191,10 +187,7 @@ def read_simulation(
             raise ValueError(f"{path}: {choice}")
         dt, method = best.dt, best.method
         save_every = save_every or max(1, best.steps // _FRAMES)
-    every = save_every or 1
-    return Simulation(
-        file.scene, file.particles, t1, float(dt), method, every, file.output, file.fit, choice, file.build
-    )
+    return Simulation(**vars(file), t1=t1, dt=dt, method=method, save_every=save_every or 1, choice=choice)
 
 
 def marked_arguments(function: Callable, table: dict[str, Any], where: str, without: Iterable[str] = ()) -> Any:
@@ -205,8 +198,10 @@ def marked_arguments(function: Callable, table: dict[str, Any], where: str, with
     return keywords
 
 
-def stable_step(path: Path, file: SceneFile) -> float:
-    """The step of dt = "stable" in a scene file [s]."""
+def step_of(path: Path, file: SceneFile) -> float | None:
+    """The step of a scene file [s], also of dt = "stable"; None where pilot runs choose it."""
+    if not isinstance(file.run.dt, str):
+        return None if file.run.dt is None else float(file.run.dt)
     assert file.run.method is not None
     try:
         return float(stable_dt(file.scene, file.particles, method=file.run.method, t1=file.run.t1))
