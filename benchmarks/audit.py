@@ -159,8 +159,7 @@ def askew() -> None:
             outside = map(mpm.geometry.Complement, shapes)
             inside = mpm.geometry.Intersection((*outside, mpm.Box((-reach, -0.1), (reach, top))))
         lower, upper = (np.floor(np.asarray(corner) / dx).astype(int) for corner in inside.bounds())
-        room = 4 if wall is mpm.SeparatingCollider else 30  # for what sinks and is thrown up
-        grid = mpm.Grid(tuple(upper - lower + 2 * room + 2), dx, origin=tuple(lower - room))
+        grid = mpm.Grid(tuple(upper - lower + 10), dx, origin=tuple(lower - 4))
         law, water = mpm.Fluid(40 * WATER * G * deep), mpm.fill(inside, grid, density=WATER)
         F, history = squeezed(law, np.asarray(WATER * G * (top - water.x[:, 1])))
         part, volume = water.volume / water.volume.sum(), water.volume / F

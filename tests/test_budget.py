@@ -89,6 +89,7 @@ CASES = {
     "midpoint-averaged volumes": {"volume": mpm.AveragedVolume(), "method": SECOND_ORDER["implicit_midpoint"]},
     "fluid": {"material": FLUIDS["fluid"], "boundary": BOUNDARIES["walls"]},
     "fluid-askew": {"material": FLUIDS["fluid"], "boundary": BOUNDARIES["askew"]},
+    "fluid-colliders": {"material": FLUIDS["fluid"], "boundary": BOUNDARIES["colliders"]},
     "semi_implicit-fluid": {"material": FLUIDS["fluid"], "method": METHODS["semi_implicit"], "transfer": mpm.PIC()},
     **{
         f"{m}-viscous": {"material": VISCOUS["viscous_solid"], "method": method, "boundary": BOUNDARIES["walls"]}
@@ -124,6 +125,7 @@ CASES = {
 
 SLOW = {
     "fluid-askew",
+    "fluid-colliders",
     "explicit-askew",
     "semi_implicit-contact planes",
     "explicit-collider and contact plane",

@@ -46,10 +46,6 @@ DOUBTFUL = {
     "a plane far away": ({"boundary": mpm.SymmetryPlane(0, -50.0)}, "SymmetryPlane .* never comes"),
     "walls far away": ({"boundary": mpm.SlipBox((-9.0, -9.0), (9.0, 9.0))}, "SlipBox .* never comes"),
     "a collider between nodes": ({"boundary": mpm.SlipCollider(BETWEEN)}, "no node of the window lies in it"),
-    "a fluid over a ball that it cannot leave": (
-        {"material": mpm.Fluid(1e4), "boundary": mpm.SlipCollider(mpm.Ball((0.15, -0.3), 0.25))},
-        r"SlipCollider \(boundary 1\) .* a fluid sinks into it",
-    ),
 }
 WELL = {
     "walls around": {"boundary": mpm.StickyBox((0.0, 0.0), (1.0, 1.0))},
@@ -61,10 +57,6 @@ WELL = {
     "a collider that waits": {"boundary": mpm.StickyCollider(mpm.Box((-1.0, -1.0), (1.0, -0.1)))},
     "one between nodes that comes": {"boundary": mpm.SlipCollider(BETWEEN, GO)},
     "one that turns": {"boundary": mpm.SlipCollider(BETWEEN, TURN)},
-    "a fluid on a half-space": {
-        "material": mpm.Fluid(1e4),
-        "boundary": mpm.StickyCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0))),
-    },
     "one that holds in the total description": {"boundary": mpm.StickyCollider(HALF, TURN)} | TOTAL,
 }
 

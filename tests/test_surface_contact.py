@@ -322,6 +322,9 @@ def vessel(kind, lower, upper, motion=None):
         case "colliders":
             low = [mpm.SeparatingCollider(mpm.HalfSpace(lower, tuple(a)), motion) for a in n]
             high = [mpm.HalfSpace((*upper[:-1], 0.0), tuple(-a)) for a in n[:-1]]
+            if d == 3:  # a floor and a side beside a box, since five take XLA minutes
+                rest = mpm.SlipBox((-INF, lower[1], -INF), upper, motion)
+                return low[0], low[2], rest
             return (*low, *(mpm.SeparatingCollider(each, motion) for each in high))
         case "slip colliders" | "sticky colliders":
             collider = mpm.SlipCollider if kind.startswith("slip") else mpm.StickyCollider

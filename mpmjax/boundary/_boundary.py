@@ -21,7 +21,7 @@ from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._plane_contact import FlatWall, wall_images
 from mpmjax.boundary._surface_contact import Faces, Surface, surface_contact
 from mpmjax.discretisation import Grid, scatter
-from mpmjax.potential import Image, Mirror, MirrorPlace, Tie, WallImage
+from mpmjax.potential import Image, Mirror, MirrorPlace, SurfaceImage, Tie, WallImage
 
 ON_THE_WALL = 1e-3  # distance within which a node is on a wall, in spacings
 
@@ -47,6 +47,7 @@ class AbstractBoundary(eqx.Module):
     pushes: ClassVar[bool] = False  # whether it has `surfaces` that push material away
     sees_faces: ClassVar[bool] = False  # whether its `contacts` need the faces of particles though it does not push
     sticks: ClassVar[bool] = False  # whether it holds the whole velocity, and not the normal one alone
+    holds_fluids: ClassVar[bool] = False  # whether it has `fluid_walls`
     meets_constraints: ClassVar[bool] = True
     """Whether it may stand in a scene with constrained bodies, such as rigid ones. What it prescribes of a node it
     prescribes of the body."""
@@ -111,8 +112,9 @@ class AbstractBoundary(eqx.Module):
 
     def fluid_walls(
         self, faces: Faces, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
-    ) -> tuple[WallImage, ...]:
-        """The maps of these in the columns of nodes around what flows (see `wall_image`)."""
+    ) -> tuple[WallImage | SurfaceImage, ...]:
+        """The maps by which it holds the nodes around what flows at all times (see `wall_image` and `surface_image`).
+        Default: those of its planes."""
         velocity = self.wall_velocity(grid.nodes(window), t, dt)
         walls = wall_images(self.planes(t), faces, grid, window, sticks=self.sticks, velocity=velocity)
         if not walls or faces.flowing.all():

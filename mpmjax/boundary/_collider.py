@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import ColliderConditions, Conditions, Slide, no_conditions
 from mpmjax.boundary._contact import AbstractContact
@@ -25,7 +25,7 @@ from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, sur
 from mpmjax.checks import between, canonical, require, require_fields
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, length, still
-from mpmjax.potential import surface_image
+from mpmjax.potential import SurfaceImage, WallImage, surface_image
 
 _ASKEW = 1e-6  # the slope to an axis up to which a half-space is across it: a turned one is so to rounding
 _FAR = 0.1  # how far behind a surface what flows is pushed though nodes hold it, in spacings
@@ -112,6 +112,27 @@ class AbstractCollider(AbstractBoundary):
         )
         return conditions, place, motion.velocity_of(place, t, dt)
 
+    def sloped(self, place: Float[Array, "m d"], t: Scalar) -> tuple[Float[Array, "m"], Float[Array, "m d"]]:
+        """The distance of points in the shape's own frame [m], and the body's unit normal there at time t: infinite and
+        zero where the distance has no slope, as a sampled one may have none."""
+        distance, slope = jax.vjp(self.shape.distance, place)
+        (slope,) = slope(jnp.ones_like(distance))
+        steepness = length(slope)
+        sloping = steepness > 0
+        normal = self.moved_by(place.dtype).turned(slope / jnp.where(sloping, steepness, 1)[:, None], t)
+        return jnp.where(sloping, distance, jnp.inf), normal
+
+    def flow_image(
+        self, flowing: NodeScalar, faces: Faces, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+    ) -> SurfaceImage:
+        """The map of the surface for what flows, by its weights at the nodes; none follow at a half-space across an
+        axis."""
+        nodes, order = grid.nodes(window), len(faces.stencil.basis.knots) - 1
+        distance, normal = self.sloped(self.moved_by(nodes.dtype).origin(nodes, t), t)
+        askew = ~jnp.isfinite(jnp.array([position for _, position, _ in self.across_axes(t)])).any()
+        velocity = self.wall_velocity(nodes, t, dt)
+        return surface_image(distance, normal, (flowing > 0) & askew, grid, window, order, velocity, self.sticks)
+
     def across_axes(self, t: Scalar) -> tuple[FlatWall, ...]:
         """The planes of a half-space at time t, one across each axis, infinitely far where the normal is not along it;
         none of other bodies."""
@@ -130,19 +151,27 @@ class AbstractCollider(AbstractBoundary):
 
 
 class AbstractHoldingCollider(AbstractCollider):
-    """A body from which material cannot part. It holds the nodes in it; what flows a half-space across an axis holds by
-    columns of nodes as a box does, so that it stays at rest: its motion has no derivative by the half-space's place and
-    normal."""
+    """A body from which material cannot part. It holds the nodes in it; what flows it holds by nodes behind its surface
+    that follow those before it, at a half-space across an axis by columns as a box does, so that it stays at rest: its
+    motion has no derivative by the place and normal of such a half-space."""
 
     meets_constraints: ClassVar[bool] = False
+    holds_fluids: ClassVar[bool] = True
 
     def planes(self, t: Scalar) -> tuple[FlatWall, ...]:
         return self.across_axes(t)
 
+    def fluid_walls(
+        self, faces: Faces, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+    ) -> tuple[WallImage | SurfaceImage, ...]:
+        flowing = scatter(faces.stencil, jnp.asarray(faces.flowing, faces.x.dtype)[None], None, grid.size)[:, 0]
+        image = self.flow_image(flowing, faces, grid, window, t, dt)
+        return image, *super().fluid_walls(faces, grid, window, t, dt)
+
 
 class StickyCollider(AbstractHoldingCollider):
     """A body to which the material sticks: nodes in it have its velocity, exactly, also after a solve. Fluids stay at
-    rest at a half-space across an axis.
+    rest.
 
     In the total description it holds the reference nodes that lie in it before its motion: a grip that can turn.
 
@@ -165,7 +194,7 @@ class StickyCollider(AbstractHoldingCollider):
 
 class SlipCollider(AbstractHoldingCollider):
     """A body along which the material slides freely and from which it cannot part: nodes in it have its velocity along
-    the normal, exactly, also after a solve. Fluids stay at rest at a half-space across an axis.
+    the normal, exactly, also after a solve. Fluids stay at rest.
 
     In the total description only a half-space without rotation: elsewhere the normal of a reference node changes as it
     slides.
@@ -190,10 +219,8 @@ class SlipCollider(AbstractHoldingCollider):
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = v_c·n, but at nodes where the distance has no slope, as a sampled one may have none."""
         nothing, place, velocity = self.seen_by(nodes, t, dt, reference)
-        slope = jax.grad(lambda x: self.shape.distance(x).sum())(place)
-        steepness = length(slope)
-        held = (self.shape.contains(place, ON_THE_WALL * spacing) & (steepness > 0))[:, None]
-        normal = self.moved_by(nodes.dtype).turned(slope / jnp.where(held, steepness[:, None], 1), t)
+        _, normal = self.sloped(place, t)
+        held = self.shape.contains(place, ON_THE_WALL * spacing)[:, None]
         touched = replace(nothing, slides=(Slide(jnp.where(held, normal, 0), jnp.where(held, velocity, 0)),))
         return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
 
@@ -232,16 +259,10 @@ class SeparatingCollider(AbstractCollider):
         return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
-        """Unit normal of the body; zero where the distance gradient vanishes, as a sampled one may."""
         motion = self.moved_by(x.dtype)
-        place = motion.origin(x, push_time)
-        distance, slope = jax.vjp(self.shape.distance, place)
-        (slope,) = slope(jnp.ones_like(distance))
-        steepness = length(slope)
-        sloping = steepness > 0
-        normal = motion.turned(slope / jnp.where(sloping, steepness, 1)[:, None], push_time)
+        distance, normal = self.sloped(motion.origin(x, push_time), push_time)
         velocity = motion.velocity_of(motion.origin(x, t), t, dt)
-        return (Surface(jnp.where(sloping, distance, jnp.inf), normal.T, self.friction, velocity.T),)
+        return (Surface(distance, normal.T, self.friction, velocity.T),)
 
     def contacts(
         self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
@@ -259,13 +280,11 @@ class SeparatingCollider(AbstractCollider):
             gap = surface_contact(now, faces).gap
         shut, planes = flowing & (gap[0] <= SHUT * faces.spacing), self.across_axes(t)
         along = jnp.isfinite(jnp.array([position for _, position, _ in planes]))
-        near = jnp.stack([flowing & ~along.any(), shut & ~along.any(), *(along[:, None] & shut)])
+        near = jnp.stack([flowing, shut & ~along.any(), *(along[:, None] & shut)])
         around = scatter(faces.stencil, near.astype(faces.x.dtype), None, grid.size)
-        (at,), order = self.surfaces(grid.nodes(window), t, dt, t), len(faces.stencil.basis.knots) - 1
-        velocity = self.wall_velocity(grid.nodes(window), t, dt)
-        image = surface_image(at.distance, at.normal.T, around[:, 0] > 0, grid, window, order, velocity)
+        image = self.flow_image(around[:, 0], faces, grid, window, t, dt)
         flow = FlowContact(image, self.friction, image.spread((around[:, 1:2] > 0).astype(faces.x.dtype))[:, 0] > 0)
-        walls = wall_images(planes, faces, grid, window, velocity=velocity)
+        walls = wall_images(planes, faces, grid, window, velocity=image.velocity)
         each = enumerate(zip(walls, planes, strict=True), 2)
         held = [plane_contact((wall,), (plane[2],), self.friction, around[:, k, None]) for k, (wall, plane) in each]
         # an explicit step's springs push no face before the surface; of what is held only what went through a map

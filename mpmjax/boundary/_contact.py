@@ -32,7 +32,16 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._conditions import PARALLEL, Conditions, OwnedImpulse
-from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Mirror, WallImage, scattered, with_one_mass
+from mpmjax.potential import (
+    AbstractSpring,
+    AbstractTerm,
+    Displacement,
+    Mirror,
+    SurfaceImage,
+    WallImage,
+    scattered,
+    with_one_mass,
+)
 
 ActiveSet = tuple[Bool[Array, "..."], ...]  # the places that are held, one mask for each contact
 
@@ -53,7 +62,7 @@ class AbstractNodes(eqx.Module):
     potential: eqx.AbstractVar[Any]
     """The potential Φ of the nodes' displacement, with the mirrors of symmetry planes and of columns that are held."""
     contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]  # the boundaries that may be left
-    walls: eqx.AbstractVar[tuple[tuple[WallImage, ...], ...]]
+    walls: eqx.AbstractVar[tuple[tuple[WallImage | SurfaceImage, ...], ...]]
     """The walls of each boundary that hold what flows at all times; empty without any."""
     brought_by: eqx.AbstractVar[tuple[int | None, ...]]
     """The number of the boundary that brings each contact; None for that of two bodies."""
@@ -174,11 +183,6 @@ class AbstractContact(eqx.Module):
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """The components of velocity on which the held places act, shape (n, d). Default: those of `fixed`."""
-        return self.fixed(active, shape)
-
-    def takes(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """The components of velocity whose impulse, after walls and planes have theirs, is its own, shape (n, d).
-        Default: those of `fixed`."""
         return self.fixed(active, shape)
 
     def representative(self) -> Bool[Array, "n"] | None:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes, friction_change
 from mpmjax.potential import SurfaceImage
 
@@ -24,11 +24,6 @@ class FlowContact(AbstractContact):
 
     def images(self, active: Array) -> tuple[SurfaceImage, ...]:
         return (self.image.where(active),)
-
-    def takes(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """All components of the nodes held and followed: masses that are one in all directions are not BᵀMB, and what
-        differs, without a sum along a plane, is the surface's."""
-        return self.image.where(active).reached(shape)
 
     def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> NodeScalar:
         """The momentum with which the nodes that follow leave the surface [kg m/s]."""

@@ -3,6 +3,7 @@ flows."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector,
 from mpmjax.boundary._contact import AbstractContact, AbstractNodes, ConstrainedNodes, N, friction_change
 from mpmjax.boundary._surface_contact import Faces
 from mpmjax.discretisation import Grid
-from mpmjax.potential import Image, WallImage, wall_image
+from mpmjax.potential import Image, SurfaceImage, WallImage, wall_image
 
 SHUT = 1e-2  # the gap up to which a plane holds what is before it, in spacings
 
@@ -116,15 +117,16 @@ class PlaneContact(AbstractContact):
 def walls_of(nodes: AbstractNodes) -> list[WallImage]:
     """The walls across axes, of contacts and those that are never left."""
     planes = (contact for contact in nodes.contacts if isinstance(contact, PlaneContact))
-    return [wall for walls in (*nodes.walls, *(plane.walls for plane in planes)) for wall in walls]
+    each = chain.from_iterable((*nodes.walls, *(plane.walls for plane in planes)))
+    return [wall for wall in each if isinstance(wall, WallImage)]
 
 
 def with_tied_columns(nodes: N) -> N:
     """The nodes whose walls that are never left hold the columns too that other walls tie to theirs: else what these
     move would be left behind."""
 
-    def tied(wall: WallImage) -> WallImage:
-        if wall.held is None:
+    def tied(wall: WallImage | SurfaceImage) -> WallImage | SurfaceImage:
+        if not isinstance(wall, WallImage) or wall.held is None:
             return wall
         columns = wall.held.astype(nodes.mass.dtype)
         for other in walls_of(nodes):

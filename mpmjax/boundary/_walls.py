@@ -89,6 +89,7 @@ class AbstractHoldingBox(AbstractBox):
     (see `wall_image`), so that it stays at rest."""
 
     motion: eqx.AbstractVar[Motion | None]  # how the walls move together; None for not at all
+    holds_fluids: ClassVar[bool] = True
 
     def __check_init__(self):
         require_fields(self)

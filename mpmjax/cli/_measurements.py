@@ -47,9 +47,8 @@ class Measurement:
     folder: Path  # where the scene file lies
     data: str
     unit: Annotated[Scalar, _POSITIVE] = 1.0
-    scale: Annotated[Scalar, finite, _NOT_ZERO] = (
-        1.0  # factor beside the unit: -1 turns a direction, 2 makes a whole of what half a model feels
-    )
+    scale: Annotated[Scalar, finite, _NOT_ZERO] = 1.0
+    """Factor beside the unit: -1 turns a direction, 2 makes a whole of what half a model feels."""
     time: str
     time_unit: Annotated[Scalar, positive] = 1.0
     length_unit: Annotated[Scalar, positive] = 1.0

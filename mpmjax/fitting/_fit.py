@@ -123,11 +123,11 @@ def fit(
         def resulted(end: Search, settled: Noise | None) -> FitResult | None:
             return None if settled is None else fit_result(problem, optimiser, end, settled, report, level)
 
-        def enough(end: Search) -> bool:
-            """Whether a search is at a minimum that the noise explains."""
-            if end.failure or not end.converged or end.joined is not None or not starts.if_needed:
+        def enough(other: Search) -> bool:
+            """Whether a search is at a lower minimum, which the noise explains."""
+            if other.failure or not other.converged or other.joined is not None or not starts.if_needed:
                 return False
-            result = resulted(end, settle_noise(problem, end, noise)[0])
+            result = None if other.cost >= end.cost else resulted(other, settle_noise(problem, other, noise)[0])
             return result is not None and not result.is_beyond
 
         ((end, settled, changing, noise),) = descend([sigmas], starts={0: zeros}, rounds=rounds, state=state)

@@ -11,7 +11,7 @@ import numpy as np
 
 from mpmjax._types import Array
 from mpmjax.checks import require
-from mpmjax.fitting._discretisation import CoarseGrid, changes_shown, unexplained
+from mpmjax.fitting._discretisation import CoarseGrid, unexplained
 from mpmjax.fitting._estimate import (
     IMPROBABLE,
     VALUE,
@@ -187,7 +187,9 @@ class FitResult(AbstractFit):
         chi += "" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}"
         who = f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations"
         lost = [] if self.converged else ["NOT CONVERGED: errors hold only at a minimum."]
-        lost += changes_shown(self.problem, self.z, self.moved)
+        if isinstance(self.moved, np.ndarray):
+            spacing, both = (self.problem.shown(place) for place in self.z + np.cumsum(self.moved, axis=0))
+            lost += [f"on twice the spacing: {spacing}", f"and with twice the step: {both}"]
         looked = [] if self.screening is None else ["", str(self.screening)]
         before = [*self.remarks, ""] if self.remarks else []
         return "\n".join([*before, first, *many, *body, "", *noise, "", chi, who, *lost, *self.warnings, *looked])

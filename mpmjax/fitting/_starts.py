@@ -135,8 +135,7 @@ def look_around(
     apart, size = len(points) - len(shares), batch_size(problem, starts.batch, len(points))
     costs = np.zeros(len(points))
     if starts.fraction < 1:
-        told = counted(progress, "{} of {} simulations are done")
-        costs = costs_at(problem, points, sigmas, size, told)
+        costs = costs_at(problem, points, sigmas, size, counted(progress, "{} of {} simulations are done"))
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
     remark = ""
     if 2 * len(failures) > len(points):

@@ -15,7 +15,7 @@ from mpmjax.discretisation import BSpline, Grid, MLSGradient, make_stencil
 class SurfaceImage(eqx.Module):
     """The map of a surface (see `surface_image`). A node i that follows its parents k, with weights τ_ik, has
 
-    v_i = (1 − n_i n_iᵀ) Σ τ_ik v_k + n_i Σ τ_ik (ξ_i/ξ_k) n_k·v_k .
+    v_i = (1 − n_i n_iᵀ) Σ τ_ik v_k + n_i Σ τ_ik (ξ_i/ξ_k) n_k·v_k,   where the surface sticks Σ τ_ik (ξ_i/ξ_k) v_k .
     """
 
     parents: Int[Array, "k n"]  # the numbers of each node's parents, shape (k, n)
@@ -24,6 +24,7 @@ class SurfaceImage(eqx.Module):
     normal: NodeVector  # n, out of the surface [-], shape (n, d)
     velocity: NodeVector | None = None
     """Velocity V of a surface that moves, at the nodes [m/s], shape (n, d); None at rest. v is then relative to it."""
+    sticks: bool = eqx.field(static=True, default=False)  # whether it holds the whole velocity
 
     @property
     def follows(self) -> Bool[Array, "n"]:
@@ -43,17 +44,26 @@ class SurfaceImage(eqx.Module):
 
     def mean(self, field: Float[Array, "n c"]) -> Float[Array, "n c"]:
         """Σ_k τ_ik f_k."""
-        return (self.part[..., None] * field[self.parents]).sum(axis=0)
+
+        def followed(field: Float[Array, "n c"]) -> Float[Array, "n c"]:
+            return (self.part[..., None] * field[self.parents]).sum(axis=0)
+
+        return jax.lax.cond(self.part.any(), followed, jnp.zeros_like, field)  # sums cost most of a map
 
     def spread(self, field: Float[Array, "n c"]) -> Float[Array, "n c"]:
         """Σ_i τ_ik f_i."""
         return jax.linear_transpose(self.mean, field)(field)[0]
 
     @property
+    def inverse(self) -> Float[Array, "n 1"]:
+        """1/ξ of nodes before the surface, shape (n, 1)."""
+        before = self.height > 0
+        return jnp.where(before, 1 / jnp.where(before, self.height, 1), 0)[:, None]
+
+    @property
     def slope(self) -> NodeVector:
         """n/ξ of nodes before the surface, shape (n, d)."""
-        before = self.height > 0
-        return jnp.where(before, self.normal.T / jnp.where(before, self.height, 1), 0).T
+        return self.inverse * self.normal
 
     def scalar(self, field: Array) -> Array:
         """B for an even scalar field."""
@@ -62,6 +72,8 @@ class SurfaceImage(eqx.Module):
 
     def vector(self, field: NodeVector) -> NodeVector:
         """B for a vector field."""
+        if self.sticks:
+            return jnp.where(self.follows[:, None], self.height[:, None] * self.mean(self.inverse * field), field)
         strain = (self.slope * field).sum(axis=1, keepdims=True)
         followed = self.mean(jnp.concatenate([field, strain], axis=1))
         along, strain = followed[:, :-1], followed[:, -1]
@@ -80,6 +92,10 @@ class SurfaceImage(eqx.Module):
         """The masses of parents, Σ τ_ik G_ikᵀ M_i G_ik with v_i = Σ τ_ik G_ik v_k: as much as BᵀMB or more, for any
         velocity."""
         d, n, height, slope = masses.shape[-1], self.normal, self.height[:, None], self.slope
+        if self.sticks:
+            parts = jnp.where(self.follows[:, None], height**2 * masses.reshape(-1, d * d), 0)
+            taken = (self.inverse**2 * self.spread(parts)).reshape(masses.shape)
+            return jnp.where(self.follows[:, None, None], 0, masses + taken)
         pushed = (masses * n[:, None]).sum(axis=2)  # M n
         across = (pushed * n).sum(axis=1, keepdims=True)
         bent = pushed - across * n  # (1 − n nᵀ) M n
@@ -118,12 +134,14 @@ def surface_image(
     window: Int[Array, "d"],
     order: int,
     velocity: NodeVector | None,
+    sticks: bool = False,
 ) -> SurfaceImage:
     """The map of a surface at signed distances [m] from the nodes, for a kernel of this order.
 
     Nodes less than ξ_b before it, half the kernel's order, follow the `filled` ones up to two spacings farther, by the
     weights of a quadratic kernel ξ_b + ½ before their foot on the surface. Normal velocities are linear across it and
-    zero on it, so that forces of a uniform pressure have nearly no sum on any node; tangential ones are constant.
+    zero on it, so that forces of a uniform pressure have nearly no sum on any node; tangential ones are constant, or
+    where it `sticks` linear too.
     """
     height, dx = distance / grid.spacing, jnp.asarray(grid.spacing, distance.dtype)
     first, sloping = max(order, 1) / 2, (normal**2).sum(axis=1) > 0
@@ -137,6 +155,7 @@ def surface_image(
         height=height,
         normal=normal,
         velocity=velocity,
+        sticks=sticks,
     )
     return image.taking(filled & (height >= first) & (height < first + 2))
 

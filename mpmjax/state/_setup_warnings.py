@@ -32,8 +32,8 @@ _CONTRAST = 100  # ratio of moduli within a cell from which it is warned of
 
 
 def warn_of_setup(scene: Scene, particles: Particles) -> None:
-    """Warn of walls and colliders that lie over the body, of grips and colliders that touch nothing, of colliders that
-    fluids sink into, of thin bodies; the floats of the scene are arrays."""
+    """Warn of walls and colliders that lie over the body, of grips and colliders that touch nothing, of thin
+    bodies; the floats of the scene are arrays."""
     boundary, total = scene.boundary, scene.total
     grid = jax.tree.map(np.asarray, scene.grid.with_layers(1))  # all bodies' nodes coincide
     dx, free, d = float(grid.spacing), np.asarray(grid.periodic), grid.dim
@@ -60,12 +60,6 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
                 why = ", or nearer to it than a quarter of their width: it pushes their faces away, half a width"
                 why += " before their centres. Move one of them."
             warn(f"{inside} of {len(x)} particles lie in or beyond the {name} at the start{why}")
-        holds = any(law.flows for law in scene.laws) and condition.collider_count > 0 and not condition.pushes
-        if holds and not any(np.isfinite(position) for _, position, _ in condition.planes(0.0)):
-            warn(
-                f"The {name} is no half-space across an axis and holds what flows at nodes: a fluid sinks into it, its "
-                "pressure off by half and more. Take a SeparatingCollider, a box or a plane."
-            )
         if mask is not None:
             may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
             if not may_meet:  # only the nodes in a particle's stencil

@@ -15,7 +15,7 @@ from mpmjax.boundary import (
     taken_by_mirrors,
 )
 from mpmjax.discretisation import Gathered
-from mpmjax.potential import Image, Mirror
+from mpmjax.potential import Image, Mirror, SurfaceImage
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping._grid_update import GridUpdate, reaction
 from mpmjax.stepping._integrator import AbstractIntegrator
@@ -141,14 +141,17 @@ def impulse_on_boundaries(
 
 
 def _taken_by_contacts(held: ConstrainedNodes[Nodes], taken: Mask) -> list[tuple[int, Mask]]:
-    """The components whose impulse is that of each contact, by its boundary's number: first what contacts fix."""
-    nodes, parts = held.unconstrained, []
-    contacts = [c for c in zip(nodes.brought_by, nodes.contacts, held.active, strict=True) if c[0] is not None]
-    for which in ("fixed", "takes"):
-        for number, contact, active in contacts:
-            mine = getattr(contact, which)(active, taken.shape) & ~taken
-            parts.append((number, mine))
-            taken = taken | mine
+    """The components whose impulse is that of each contact, by its boundary's number: first what contacts fix, then all
+    of the nodes that surfaces reach. There masses that are one in all directions are not BᵀMB, and what differs,
+    without a sum along a plane, is the surface's."""
+    nodes, shape, parts = held.unconstrained, taken.shape, []
+    contacts = zip(nodes.brought_by, nodes.contacts, held.active, strict=True)
+    masks = [(number, contact.fixed(active, shape)) for number, contact, active in contacts]
+    masks += [(number, wall.reached(shape)) for number, wall in held.walls if isinstance(wall, SurfaceImage)]
+    for number, mask in masks:
+        if number is not None:
+            parts.append((number, mask & ~taken))
+            taken = taken | mask
     return parts
 
 

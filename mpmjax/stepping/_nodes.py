@@ -21,7 +21,7 @@ from mpmjax.boundary import (
 )
 from mpmjax.discretisation import Stencil, in_section, in_space, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
-from mpmjax.potential import AbstractTerm, Forces, Mirror, WallImage
+from mpmjax.potential import AbstractTerm, Forces, Mirror, SurfaceImage, WallImage
 from mpmjax.state import AbstractLayerImage, Particles, Scene, load_force, points_of, terms_of
 from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
 
@@ -38,7 +38,7 @@ class Nodes(AbstractNodes):
     potential: ElasticPotential  # Φ, a function of nodal displacements
     conditions: Conditions  # the conditions that the boundaries prescribe
     contacts: tuple[AbstractContact, ...] = ()  # the contacts of the scene; none of them is active here
-    walls: tuple[tuple[WallImage, ...], ...] = ()  # the walls of each boundary that are never left
+    walls: tuple[tuple[WallImage | SurfaceImage, ...], ...] = ()  # the walls of each boundary that are never left
     brought_by: tuple[int | None, ...] = eqx.field(static=True, default=())
     """The number of the boundary that brings each contact; None for that of two bodies."""
     loose: "Nodes | None" = None  # the nodes before the constraints of bodies; None without any
@@ -250,7 +250,8 @@ def with_boundaries(
         moved = places_of(particles, potential.stencil, grid.size)
         place = jnp.where(slid[:, None] & nodes.occupied, moved, conditions.colliders.position)
         conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
-    faces, walls, flows = None, (), any(law.flows for law in scene.laws) and any(b.planes(t) for b in scene.boundary)
+    faces, walls = None, ()
+    flows = any(law.flows for law in scene.laws) and any(boundary.holds_fluids for boundary in scene.boundary)
     if flows or any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
         faces = faces_of(scene, particles, potential, t, dt, force_at)
         walls = tuple(boundary.fluid_walls(faces, grid, window, t, dt) for boundary in scene.boundary) if flows else ()
