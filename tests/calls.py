@@ -121,10 +121,10 @@ FITTING = {
     mpm.fitting.LBFGS: {},
     mpm.fitting.Adam: {},
     mpm.Series: TRUST | {"times": [0.1, 0.2], "data": [1.0, 2.0], "of": reached},
-    mpm.Tracks: TRUST | {"times": [0.1], "positions": [[[0.1, 0.2]]], "which": [0]},
+    mpm.Tracks: TRUST | {"times": [0.1], "data": [[[0.1, 0.2]]], "which": [0]},
     mpm.Curve: TRUST | {"x": [0.1, 0.2], "data": [1.0, 2.0], "of": reached},
-    mpm.fitting.Force: TRUST | {"times": [0.1], "forces": [[1.0, 2.0]]},
-    mpm.fitting.Torque: TRUST | {"times": [0.1], "forces": [[1.0]]},
+    mpm.fitting.Force: TRUST | {"times": [0.1], "data": [[1.0, 2.0]]},
+    mpm.fitting.Torque: TRUST | {"times": [0.1], "data": [[1.0]]},
     mpm.fitting.Starts: {
         "count": 8,
         "fraction": 0.5,

@@ -272,7 +272,7 @@ def test_a_columns_unit_must_be_the_one_that_is_given(copied, simulation):
 
 def replaced(simulation, folder):
     """The simulation with the [fit] table of a file."""
-    return simulation._replace(fit=tomllib.loads((folder / "bar.toml").read_text())["fit"])
+    return dataclasses.replace(simulation, fit=tomllib.loads((folder / "bar.toml").read_text())["fit"])
 
 
 @pytest.mark.parametrize(

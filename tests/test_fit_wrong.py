@@ -312,6 +312,45 @@ def test_a_wall_that_the_coarse_grid_cannot_have_is_said():
     assert "errors hold nothing of the grid" in str(found)
 
 
+def lowered(e, by):
+    """All but the floor [m] lower, data too: the floor as much higher."""
+    return eqx.tree_at(
+        lambda e: (e.particles.x, e.observations[0].data), e, (e.particles.x - by, e.observations[0].data - by)
+    )
+
+
+def dropped(height):
+    """A bar dropped on a floor, and its motion with noise where the floor stands higher."""
+    grid = mpm.Grid((14,), 0.05, origin=(-4,))
+    q = mpm.fill(mpm.Box((0.02,), (0.42,)), grid, particles_per_cell=4, density=1e3)
+    q = eqx.tree_at(lambda q: q.v, q, jnp.full_like(q.v, -1.2))
+    scene = mpm.Scene(grid, mpm.NeoHookean(5e4, 0.3), gravity=(-9.81,), boundary=mpm.ContactPlane(0, 0.0))
+    which, times = np.arange(2, q.count, 8), np.arange(1, 31) * 4e-3
+    seen = mpm.Tracks(times, np.zeros((30, len(which), 1)), which=which, sigma=2e-4)
+    e = mpm.Experiment(scene, q, t1=0.12, dt=2e-3, observations=seen)
+    low = lowered(e, height)
+    x = low.predictions(low.run())[0] + height + 2e-4 * np.random.default_rng(0).normal(size=seen.data.shape)
+    return eqx.tree_at(lambda e: e.observations[0].data, e, x)
+
+
+@pytest.mark.thorough
+def test_a_floor_that_stands_elsewhere_is_among_what_the_fit_advises():
+    """E is 44 % high, and its interval begins above the truth. With the floor's height as a parameter both are found. A
+    plane must stay on the lattice: its place as a parameter makes most starts fail, and why is said."""
+    seen, both = dropped(0.01), stiffness(4e4) | {"height": mpm.Unbounded(update=lowered, start=0.0, scale=0.01)}
+    fit = partial(mpm.fit, discretisation=False)
+    with pytest.warns(UserWarning, match=r"residuals of 'tracks' drift: .* place and friction of a wall"):
+        missed = fit(seen, stiffness(4e4), starts=1)["E"]
+    assert missed.interval[0] > 5e4
+    found = fit(seen, both)
+    assert not found.is_beyond
+    for name, true in {"E": 5e4, "height": 0.01}.items():
+        assert found[name].interval[0] < true < found[name].interval[1]
+    place = mpm.Unbounded(lambda e: e.scene.boundary[0].position, start=0.0, scale=0.01)
+    with pytest.warns(UserWarning, match="23 of 24 starts failed, the first since: A ContactPlane must lie at"):
+        fit(seen, stiffness(4e4) | {"place": place})
+
+
 def test_a_fit_on_finer_grids_starts_from_all_minima_and_says_what_its_misfit_is(both_grids):
     """From twice the truth the coarse grid has several minima, from each of which the finer one starts. Its misfit
     falls with the spacing; one of a sensor that drifts does not."""

@@ -311,8 +311,8 @@ def test_bad_arguments_are_refused(arguments, message):
         (lambda: mpm.Box((0.0, 0.0), (1.0, 0.0)), "lower corner must lie below its upper one"),
         (lambda: mpm.Box((0.0, 0.0), (1.0,)), "as many coordinates"),
         (lambda: mpm.Box((0.0, np.nan), (1.0, 1.0)), "lower corner must lie below"),
-        (lambda: mpm.Ball((0.0, 0.0), 0.0), "radius must be greater than zero"),
-        (lambda: mpm.Ball((0.0, np.inf), 1.0), "centre must be finite"),
+        (lambda: mpm.Ball((0.0, 0.0), 0.0), r"radius \[m\] must be greater than zero"),
+        (lambda: mpm.Ball((0.0, np.inf), 1.0), r"centre \[m\] must be finite"),
     ],
 )
 def test_bad_regions_are_refused(make, message):

@@ -456,7 +456,7 @@ ERRORS = [
     ),
     (
         {"boundary": [{"kind": "SlipCollider", "shape": {"kind": "Ball", "centre": [0, 0], "radius": -1}}]},
-        "[[boundary]] 1 [shape]: A ball's radius must be greater than zero, got -1.0.",
+        "[[boundary]] 1 [shape]: Ball's radius [m] must be greater than zero, got -1.0.",
     ),
     (
         {"boundary": [{"kind": "SlipCollider", "shape": {"kind": "Union", "regions": [DISC, {"kind": "Box"}]}}]},

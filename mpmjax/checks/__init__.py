@@ -24,7 +24,6 @@ from mpmjax.checks._values import (
     is_traced as is_traced,
     positive as positive,
     require as require,
-    require_between as require_between,
     require_finite as require_finite,
     require_memory as require_memory,
     require_placement as require_placement,

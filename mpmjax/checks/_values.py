@@ -185,17 +185,6 @@ def coordinates(name: str, point: Any) -> int:
     return len(point)
 
 
-def require_between(name: str, value: Any, lower: float | int, upper: float | int, *, open_ends: bool = False) -> None:
-    """Every number of `value` must lie in [lower, upper], or in (lower, upper) with `open_ends`."""
-    require_finite(name, value)
-    words = f"strictly between {lower} and {upper}" if open_ends else f"from {lower} to {upper}"
-
-    def inside(a: Any) -> Any:
-        return (a > lower) & (a < upper) if open_ends else (a >= lower) & (a <= upper)
-
-    require_that(f"{name} must be {words}", inside, value)
-
-
 @dataclass(frozen=True)
 class Mark:
     """A condition in an annotation (see `require_fields`), which signatures show by its words."""
@@ -215,9 +204,17 @@ tolerance = Mark("a relative tolerance", require_tolerance)
 
 
 def between(lower: float | int, upper: float | int, *, open_ends: bool = False) -> Mark:
-    """The mark of numbers that `require_between` takes."""
+    """The mark of numbers in [lower, upper], or in (lower, upper) with `open_ends`."""
     words = f"strictly between {lower} and {upper}" if open_ends else f"from {lower} to {upper}"
-    return Mark(words, partial(require_between, lower=lower, upper=upper, open_ends=open_ends))
+
+    def inside(a: Any) -> Any:
+        return (a > lower) & (a < upper) if open_ends else (a >= lower) & (a <= upper)
+
+    def check(name: str, value: Any) -> None:
+        require_finite(name, value)
+        require_that(f"{name} must be {words}", inside, value)
+
+    return Mark(words, check)
 
 
 def whole(least: int) -> Mark:

@@ -18,14 +18,14 @@ import numpy as np
 from mpmjax.analysis import METHODS, Trial, energy, grid_mass, name_of, pieces, work_precision
 from mpmjax.checks import require, warn
 from mpmjax.cli._fit_file import FitFile, read_fit, refinements
-from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
-from mpmjax.fitting import Experiment, FitProblem, Profile, fit, fit_refined, fit_staged, predict_observations, profile
+from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, step_of
+from mpmjax.fitting import Experiment, FitProblem, Profile, fit, fit_refined, fit_staged, profile
 from mpmjax.io import FIELDS_WRITTEN, check_place, load, record, replacing, reporting, standing_in, stopping, table
 from mpmjax.native import BACKENDS, backend
 from mpmjax.simulation import Problem, Run, SimulationError, initial_state, no_steps, run_to
 from mpmjax.state import Particles
 from mpmjax.stepping import Explicit, stable_dt, step
-from mpmjax.viz import draw_chart, draw_fit, render, write_fit, write_trials
+from mpmjax.viz import draw_chart, render, write_fit, write_trials
 
 
 def run_scene(
@@ -251,9 +251,7 @@ def fit_scene(
     if not result.interrupted:
         result.warn_of_runs()
     print(f"{iterations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all", flush=True)
-    report = whole, tuple(drawn), predict_observations(result, whole)
-    numbers = write_fit(outcome, plot.with_suffix(".json"), *report)
-    print(f"written {draw_fit(result, plot, *report)} and {numbers}")
+    print(f"written {plot} and {write_fit(outcome, plot, whole, tuple(drawn))}")
     if stop.signal or result.interrupted:
         sys.exit(128 + (stop.signal or signal.SIGINT))
 
@@ -285,8 +283,8 @@ def chart_scene(scene: Path, output: Path, changes: Sequence[str], *, error: flo
         f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9} {'linearisation':>13}",
         flush=True,
     )
-    dt = stable_step(scene, file) if file.run.dt == "stable" else file.run.dt
-    extra = () if dt is None or file.run.method is None else ((file.run.method, float(dt)),)
+    dt = step_of(scene, file)
+    extra = () if dt is None or file.run.method is None else ((file.run.method, dt),)
     comparison = work_precision(
         file.build,
         t1=file.run.t1,
@@ -326,9 +324,8 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
     bounds = {name_of(method): float(stable_dt(scene, particles, method=method)) for method in METHODS}
     say("longest step", ", ".join(f"{name} {dt:.3g} s" for name, dt in bounds.items() if np.isfinite(dt)))
     say("without bound", ", ".join(name for name, dt in bounds.items() if np.isinf(dt)))
-    method, dt = run.method, stable_step(path, file) if run.dt == "stable" else run.dt
+    method, dt = run.method, step_of(path, file)
     if method is not None and dt is not None:
-        dt = float(dt)
         of_explicit, bound = dt / bounds[name_of(Explicit())], float(stable_dt(scene, particles, method=method))
         say("steps", f"{run.t1 / dt:.0f} of {dt:.4g} s with {name_of(method)}, {of_explicit:.3g} of Explicit's longest")
         begun = time.perf_counter()

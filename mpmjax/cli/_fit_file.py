@@ -1,19 +1,19 @@
 """The `[fit]` table of a scene file (docs/scene_files.md): what is fitted, and what was measured."""
 
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Scalar
-from mpmjax.checks import require, require_positive, shortened
+from mpmjax.checks import between, require, require_positive, shortened
 from mpmjax.cli._measurements import observation
-from mpmjax.cli._scene_file import Simulation, read_simulation
+from mpmjax.cli._scene_file import Simulation, marked_arguments, read_simulation
 from mpmjax.fitting import (
     AbstractOptimiser,
     AbstractParameter,
@@ -24,7 +24,7 @@ from mpmjax.fitting import (
     Starts,
     Unbounded,
 )
-from mpmjax.io import arguments, decode, require_keys
+from mpmjax.io import decode, require_keys
 
 
 class FitFile(NamedTuple):
@@ -71,11 +71,11 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
         require(len(sources) > 0, "[fit] needs an [[fit.observation]], or an [[fit.experiment]] whose scene has one.")
         parts = [_experiments(*source) for source in sources]
         chosen = {key: value for key, value in table.items() if key in _SETTINGS}
-        settings = fit_settings(**arguments(fit_settings, chosen, "[fit]"))
+        settings = fit_settings(**marked_arguments(fit_settings, chosen, "[fit]"))
         tables = _tables(table, "parameter")
         require(len(tables) > 0, "[fit] needs a [[fit.parameter]].")
         first = [fitted for fitted, _ in parts]
-        keys = [arguments(fit_parameter, t, "[[fit.parameter]]", without=("experiments",)) for t in tables]
+        keys = [marked_arguments(fit_parameter, t, "[[fit.parameter]]", without=("experiments",)) for t in tables]
         named = [fit_parameter(first, **each) for each in keys]
         names = [name for name, _ in named]
         require(len(set(names)) == len(names), f"[[fit.parameter]] {', '.join(names)}: each needs a name of its own.")
@@ -105,21 +105,19 @@ _KEYS = ("t1", *_SETTINGS, *_TABLES)
 
 def fit_settings(
     *,
-    level: Scalar = 0.95,
+    level: Annotated[Scalar, between(0, 1, open_ends=True)] = 0.95,
     starts: int | Literal["auto"] = "auto",
-    fraction: Scalar | None = None,
+    fraction: Annotated[Scalar, between(0, 1)] | None = None,
     horizons: tuple[float, ...] | bool = False,
     refine: int | tuple[int, ...] = (),
     discretisation: bool = True,
     optimiser: AbstractOptimiser | None = None,
 ) -> dict[str, Any]:
     """How to fit, of a [fit] table."""
-    require(0 < level < 1, f"[fit] level must lie between 0 and 1, got {level!r}.")
     many = starts != "auto" and starts > 1
     require(starts == "auto" or starts > 0, f"[fit] starts must be one at least, got {starts}.")
     require(many or fraction is None, "[fit] fraction is one of starts: give these too.")
     fraction = 0.375 if fraction is None else fraction
-    require(0 <= fraction <= 1, f"[fit] fraction must be from 0 to 1, got {fraction!r}.")
     require(not (many and horizons), "[fit] takes either starts or horizons.")
     finer = refinements(refine if isinstance(refine, tuple) else (refine,), "[fit] refine")
     places = starts if starts == "auto" else Starts(starts, float(fraction))
@@ -140,7 +138,7 @@ def _refined(simulation: Simulation, n: int) -> Simulation:
     if n == 1:
         return simulation
     scene, particles = simulation.build(n)
-    return simulation._replace(scene=scene, particles=particles, dt=simulation.dt / n)
+    return replace(simulation, scene=scene, particles=particles, dt=simulation.dt / n)
 
 
 def leaf_of(path: str, experiment: Experiment) -> Any:

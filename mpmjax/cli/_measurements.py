@@ -4,15 +4,15 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import numpy as np
 
 from mpmjax._types import Array, Scalar
 from mpmjax.analysis import energy_of
-from mpmjax.checks import require, require_positive
-from mpmjax.cli._scene_file import Simulation
+from mpmjax.checks import Mark, finite, positive, require, require_positive, require_that
+from mpmjax.cli._scene_file import Simulation, marked_arguments
 from mpmjax.discretisation import Grid
 from mpmjax.fitting import (
     AbstractObservation,
@@ -33,8 +33,10 @@ from mpmjax.fitting import (
     stated_unit,
 )
 from mpmjax.geometry import AbstractRegion
-from mpmjax.io import arguments
 from mpmjax.state import Particles, Scene
+
+_POSITIVE = Mark("positive", lambda name, value: require_positive(f"scale = -1 turns a direction; {name}", value))
+_NOT_ZERO = Mark("not zero", lambda name, value: require_that(f"{name} must not be zero", lambda a: a != 0, value))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,11 +46,12 @@ class Measurement:
     simulation: Simulation
     folder: Path  # where the scene file lies
     data: str
-    unit: Scalar = 1.0
-    scale: Scalar = 1.0  # factor beside the unit: -1 turns a direction, 2 makes a whole of what half a model feels
+    unit: Annotated[Scalar, _POSITIVE] = 1.0
+    scale: Annotated[Scalar, finite, _NOT_ZERO] = 1.0
+    """Factor beside the unit: -1 turns a direction, 2 makes a whole of what half a model feels."""
     time: str
-    time_unit: Scalar = 1.0
-    length_unit: Scalar = 1.0
+    time_unit: Annotated[Scalar, positive] = 1.0
+    length_unit: Annotated[Scalar, positive] = 1.0
     sigma: Scalar | None = None
     weight: Scalar = 1.0
     robust: Scalar | None = None
@@ -65,16 +68,9 @@ class Measurement:
         return {"sigma": self.sigma, "weight": self.weight, "robust": self.robust, "name": name}
 
     def columns(self, *names: str) -> Columns:
-        """Columns of the CSV file, after a look at the units."""
-        self.check_units()
+        """Columns of the CSV file."""
         require(len(set(names)) == len(names), f"{_HEADER} names a column twice: {', '.join(names)}.")
         return Columns(self.folder / self.data, *names)
-
-    def check_units(self, other: str = "time_unit or length_unit") -> None:
-        """Check that the units are positive, and that no factor is zero."""
-        require_positive(f"{_HEADER} scale = -1 turns a direction; unit", self.unit)
-        require(self.scale != 0 and np.isfinite(self.scale), f"{_HEADER} scale must not be zero, got {self.scale}.")
-        require_positive(f"{_HEADER} {other}", self.time_unit * self.length_unit)
 
     def times(self, columns: Columns, *, grow: bool = True) -> np.ndarray:
         """The times of the rows [s]."""
@@ -132,7 +128,7 @@ def observation(
     there = isinstance(kind, str) and kind in KINDS
     require(there, f"{_HEADER} kind must be one of {', '.join(KINDS)}, got {kind!r}.")
     keys, shared = keys_of(str(kind))
-    values = arguments(keys, {k: v for k, v in table.items() if k != "kind"}, f"{_HEADER} {kind}")
+    values = marked_arguments(keys, {k: v for k, v in table.items() if k != "kind"}, f"{_HEADER} {kind}")
     chosen: dict[str, Any] = {"time": ""} | {name: values.pop(name) for name in shared if name in values}
     measurement = Measurement(simulation=simulation, folder=folder, **chosen)
     made = KINDS[str(kind)][0](measurement, **values)
@@ -166,7 +162,7 @@ def _shown(made: Any, m: Measurement, keys: dict[str, Any]) -> Any:
     if key is None or "grid" in keys:  # a picture
         return made
     heads = (keys[key],) if isinstance(keys[key], str) else keys[key]
-    si = _SI.get(key, "m" if isinstance(made.of, Extent) else "J")
+    si = _SI.get(key, "m" if isinstance(getattr(made, "of", None), Extent) else "J")
 
     def named(head: str, factor: float, of: str) -> str:
         unit = of if factor == 1 else f"{factor:g} {of}"
@@ -326,7 +322,6 @@ class _EnergyPart(eqx.Module):
 @_kind("Density", without=("time", "length_unit"))
 def _density(m: Measurement, *, grid: Grid, time: str = "times", value: str = "density") -> Series:
     path = m.folder / m.data
-    m.check_units("time_unit")
     t, pictures = read_arrays(path, time, value)
     t, pictures = t * float(m.time_unit), pictures * float(m.unit) * float(m.scale)
     shape = tuple(int(n) for n in grid.shape)
@@ -346,14 +341,14 @@ def _density(m: Measurement, *, grid: Grid, time: str = "times", value: str = "d
 
 
 @_kind("Cloud")
-def _cloud(m: Measurement, *, place: tuple[str, ...], grid: Grid, mass: Scalar | None = None) -> Series:
+def _cloud(
+    m: Measurement, *, place: tuple[str, ...], grid: Grid, mass: Annotated[Scalar, positive, "kg"] | None = None
+) -> Series:
     columns, x = m.places(place, m.time, grid=grid)
     t = m.times(columns, grow=False)
     columns.require(
         np.diff(t, prepend=-np.inf) >= 0, f"{m.time} {{{m.time}}} comes after a later one: sort the rows by time."
     )
-    if mass is not None:
-        require_positive(f"{_HEADER} mass [kg]", mass)
     total = float(m.simulation.particles.mass.sum() if mass is None else mass)
     picture, times = Density(grid), np.unique(t)
     pictures = np.stack([picture.of_points(x[t == now], total) for now in times])

@@ -3,10 +3,10 @@
 import itertools
 import os
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,9 +14,20 @@ import numpy as np
 
 from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
-from mpmjax.checks import canonical, checked, require, require_positive, shortened, warn
+from mpmjax.checks import (
+    canonical,
+    checked,
+    marks_of,
+    positive,
+    require,
+    require_marks,
+    require_positive,
+    shortened,
+    warn,
+    whole,
+)
 from mpmjax.geometry import AbstractRegion
-from mpmjax.io import arguments, check_fields, decode, load, save
+from mpmjax.io import arguments, check_fields, decode, load, parameters_of, save
 from mpmjax.simulation import number_of_steps
 from mpmjax.state import Particles, Scene, attach, fill, join, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
@@ -27,51 +38,44 @@ _FRAMES = 50  # number of frames that are saved if neither it nor the step is gi
 class RunSettings(eqx.Module):
     """The `[run]` table of a scene file."""
 
-    t1: float = eqx.field(converter=float)  # end time [s]
+    t1: Annotated[float, positive, "s"] = eqx.field(converter=float)  # end time
     dt: Scalar | str | None = None  # step [s], or "stable"; None for "auto"
     method: AbstractIntegrator | None = None  # None for "auto"
-    save_every: int | None = None  # steps from frame to frame; None if the file does not say
+    save_every: Annotated[int, whole(1)] | None = None  # steps from frame to frame; None if the file does not say
     precision: Literal["float32", "float64"] | None = None  # None for JAX's own, in the shell float64
-    error: float = eqx.field(converter=float, default=1e-2)  # relative error that "auto" aims at
-    most_seconds: float = eqx.field(converter=float, default=60.0)  # seconds that its pilot runs may take
+    error: Annotated[float, positive] = eqx.field(converter=float, default=1e-2)  # relative one that "auto" aims at
+    most_seconds: Annotated[float, positive] = eqx.field(converter=float, default=60.0)  # that its pilot runs may take
 
     def __check_init__(self):
         if isinstance(self.dt, str):
             require(self.dt == "stable", f'[run] dt must be a step in seconds, "stable" or "auto", got {self.dt!r}.')
         elif self.dt is not None:
             require_positive("[run] dt", self.dt)
-        for name in ("t1", "error", "most_seconds"):
-            require_positive(f"[run] {name}", getattr(self, name))
-        every = self.save_every is None or self.save_every >= 1
         double = jnp.result_type(float) == jnp.float64 or self.precision != "float64"
         require(double, '[run] precision = "float64" needs jax.config.update("jax_enable_x64", True) first.')
-        require(every, f"[run] save_every must be at least 1, got {self.save_every}.")
 
 
-class SceneFile(NamedTuple):
+@dataclass(frozen=True)
+class SceneFile:
     """A scene file as it was read: "auto" and "stable" are left to be resolved."""
 
     scene: Scene
     particles: Particles
     run: RunSettings
-    output: dict[str, Any]
-    fit: dict[str, Any] | None
-    build: Build
+    output: dict[str, Any]  # the `[output]` table, as arguments of `record` and `save`
+    fit: dict[str, Any] | None  # the `[fit]` table, not read yet; None without one
+    build: Build  # makes the scene and its particles on n times as many cells a direction, from n
 
 
-class Simulation(NamedTuple):
+@dataclass(frozen=True)
+class Simulation(SceneFile):
     """A scene file with its step and method resolved, ready to be run."""
 
-    scene: Scene
-    particles: Particles
     t1: float
     dt: float
     method: AbstractIntegrator
     save_every: int
-    output: dict[str, Any]  # the `[output]` table, as arguments of `record` and `save`
-    fit: dict[str, Any] | None  # the `[fit]` table, not read yet; None without one
     choice: str | None  # the choice for "auto" or "stable", and why; None if there was none
-    build: Build  # makes the scene and its particles on n times as many cells a direction, from n
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -114,7 +118,7 @@ def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
         both = '[run] method = "auto" goes with dt = "auto": the cheapest of both is chosen together.'
         require(auto != {"method"}, both)
         settings: dict[str, Any] = {} if "method" in auto else {"method": Explicit()}
-        settings |= arguments(RunSettings, {k: v for k, v in run_table.items() if k not in auto}, "[run]")
+        settings |= marked_arguments(RunSettings, {k: v for k, v in run_table.items() if k not in auto}, "[run]")
         run = RunSettings(**settings)
         output = arguments(save, output_table, "[output]", without=("path", "run"))
         check_fields(output.get("fields", ()), "[output] fields")
@@ -157,13 +161,12 @@ def read_simulation(
     "auto", within `most_seconds` or what the file says. `progress` and `say` are those of `work_precision`."""
     file = read_scene_file(path, changes)
     run, choice = file.run, None
-    t1, dt, method, save_every = run.t1, run.dt, run.method, run.save_every
+    t1, dt, method, save_every = run.t1, step_of(path, file), run.method, run.save_every
     require(
         most_seconds is None or dt is None or method is None,
         "--most-seconds is for pilot runs, and there are none: the file gives dt and method.",
     )
-    if dt == "stable":
-        dt = stable_step(path, file)
+    if dt is not None and run.dt == "stable":
         steps = round(t1 / dt)
         choice = f"dt = {dt:.6g} s ({steps} steps), the longest that is stable as the particles start"
         save_every = save_every or max(1, steps // _FRAMES)
@@ -184,14 +187,21 @@ def read_simulation(
             raise ValueError(f"{path}: {choice}")
         dt, method = best.dt, best.method
         save_every = save_every or max(1, best.steps // _FRAMES)
-    every = save_every or 1
-    return Simulation(
-        file.scene, file.particles, t1, float(dt), method, every, file.output, file.fit, choice, file.build
-    )
+    return Simulation(**vars(file), t1=t1, dt=dt, method=method, save_every=save_every or 1, choice=choice)
 
 
-def stable_step(path: Path, file: SceneFile) -> float:
-    """The step of dt = "stable" in a scene file [s]."""
+def marked_arguments(function: Callable, table: dict[str, Any], where: str, without: Iterable[str] = ()) -> Any:
+    """`arguments` of a table, whose values are those that marks of the function's annotations ask for."""
+    keywords = arguments(function, table, where, without=without)
+    for name, (hint, _) in parameters_of(function).items():
+        require_marks(f"{where} {name}", keywords.get(name), marks_of(hint))
+    return keywords
+
+
+def step_of(path: Path, file: SceneFile) -> float | None:
+    """The step of a scene file [s], also of dt = "stable"; None where pilot runs choose it."""
+    if not isinstance(file.run.dt, str):
+        return None if file.run.dt is None else float(file.run.dt)
     assert file.run.method is not None
     try:
         return float(stable_dt(file.scene, file.particles, method=file.run.method, t1=file.run.t1))

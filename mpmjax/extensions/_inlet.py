@@ -1,14 +1,14 @@
 """Controls by which particles enter and leave: nozzles, outflows, excavations."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Point, Scalar, components
-from mpmjax.checks import coordinates, require, require_fields, require_positive, require_that
+from mpmjax.checks import coordinates, positive, require, require_fields, require_that
 from mpmjax.geometry import AbstractRegion, HalfSpace, Motion
 from mpmjax.state import Particles, Scene
 
@@ -64,12 +64,11 @@ class Inlet(eqx.Module):
     stock: Particles
     velocity: Point | Motion
     gate: HalfSpace
-    length: Scalar
+    length: Annotated[Scalar, positive, "m"]
     first: int = eqx.field(static=True, default=0)
 
     def __check_init__(self):
         require_fields(self)
-        require_positive("An Inlet's length [m]", self.length)
         d, motion = self.gate.dim, self.velocity
         size = motion.dim if isinstance(motion, Motion) else coordinates("An Inlet's velocity", motion)
         require(

@@ -81,12 +81,4 @@ def unexplained(
     return r - np.clip(share, 0, 1) * change
 
 
-def changes_shown(problem: FitProblem, z: np.ndarray, moved: Float[np.ndarray, "2 n"] | str | None) -> list[str]:
-    """Lines that say where the minimum moves, as of `CoarseGrid`; none where that is not known."""
-    if not isinstance(moved, np.ndarray):
-        return []
-    spacing, both = (problem.shown(place) for place in z + np.cumsum(moved, axis=0))
-    return [f"on twice the spacing: {spacing}", f"and with twice the step: {both}"]
-
-
 _STEPS = 3

@@ -88,16 +88,12 @@ class AbstractObservation(eqx.Module):
         measured = np.isfinite(self.data)
         require(not np.isinf(self.data).any(), f"{name} must have finite data, or NaN where nothing was measured.")
         require(measured.sum() > 0, f"{name} has no data: it needs a finite number at least.")
-        if self.sigma is not None:
-            require_positive(f"The sigma of {name}", self.sigma)
-            fault = f"The sigma of {name} must fit its data of shape {self.data.shape}, got {np.shape(self.sigma)}."
-            try:
-                np.broadcast_to(self.sigma, self.data.shape)
-            except ValueError:
-                raise ValueError(fault) from None
-        require_positive(f"The weight of {name}", self.weight)
-        if self.robust is not None:
-            require_positive(f"The robust limit of {name}", self.robust)
+        sigma: Any = self.sigma
+        for what, value in {"sigma": sigma, "weight": self.weight, "robust limit": self.robust}.items():
+            if value is not None:
+                require_positive(f"The {what} of {name}", value)
+        fault = f"The sigma of {name} must fit its data of shape {self.data.shape}, got {np.shape(sigma)}."
+        require(fits(sigma, self.data.shape), fault)
 
     @property
     def title(self) -> str:
@@ -193,6 +189,14 @@ class AbstractObservation(eqx.Module):
     def residuals_of(self, seen: Any, run: Run, sigma: Scalar | Array) -> Array:
         """The residuals of a run of which it has seen the states; NaN where the run met a fault."""
         return jnp.where(run.statistics.healthy, self.residuals(self.predict(seen, run), sigma), jnp.nan)
+
+
+def fits(sigma: Any, shape: tuple[int, ...]) -> bool:
+    """Whether a noise, if there is one, broadcasts against data of a shape."""
+    try:
+        return np.broadcast_to(sigma, shape).shape == shape
+    except ValueError:
+        return False
 
 
 def drawn_nearer(r: Array, limit: Scalar | Array) -> Array:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Scalar
-from mpmjax.checks import between, checked, require, shortened, warn
+from mpmjax.checks import between, checked, require, shortened, warn, whole
 from mpmjax.fitting._discretisation import look_at_coarse_grid
 from mpmjax.fitting._estimate import table
 from mpmjax.fitting._evaluation import Evaluation
@@ -123,11 +123,11 @@ def fit(
         def resulted(end: Search, settled: Noise | None) -> FitResult | None:
             return None if settled is None else fit_result(problem, optimiser, end, settled, report, level)
 
-        def enough(end: Search) -> bool:
-            """Whether a search is at a minimum that the noise explains."""
-            if end.failure or not end.converged or end.joined is not None or not starts.if_needed:
+        def enough(other: Search) -> bool:
+            """Whether a search is at a lower minimum, which the noise explains."""
+            if other.failure or not other.converged or other.joined is not None or not starts.if_needed:
                 return False
-            result = resulted(end, settle_noise(problem, end, noise)[0])
+            result = None if other.cost >= end.cost else resulted(other, settle_noise(problem, other, noise)[0])
             return result is not None and not result.is_beyond
 
         ((end, settled, changing, noise),) = descend([sigmas], starts={0: zeros}, rounds=rounds, state=state)
@@ -259,9 +259,8 @@ class EnsembleFit(eqx.Module):
     @property
     def errors(self) -> np.ndarray:
         """The standard error of each estimate of the n numbers, NaN where the fit failed, shape (k, n)."""
-        errors = np.full((len(self.fits), len(self._done[0].estimates)), np.nan)
-        errors[[fit is not None for fit in self.fits]] = self._columns[1]
-        return errors
+        lost = [np.nan] * len(self._done[0].estimates)
+        return np.array([lost if fit is None else [e.error for e in fit.estimates] for fit in self.fits])
 
     @property
     def alike(self) -> np.ndarray:
@@ -309,7 +308,7 @@ def fit_ensemble(
     experiments: tuple[Any, ...] | list[Any],
     parameters: dict[str, AbstractParameter],
     *,
-    batch: int | None = None,
+    batch: Annotated[int, whole(1)] | None = None,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Level = 0.95,
     optimiser: AbstractOptimiser | None = None,

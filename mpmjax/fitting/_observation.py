@@ -10,7 +10,7 @@ import numpy as np
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import as_floats, require, require_fields, require_finite
 from mpmjax.fitting._columns import ROUNDED, after
-from mpmjax.fitting._experiment import AbstractObservation, Numbers, Shown
+from mpmjax.fitting._experiment import AbstractObservation, Shown
 from mpmjax.fitting._quantities import Markers
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene
@@ -83,24 +83,11 @@ class Curve(_Measured):
         return (measured < x[0] - slack) | (measured > x[-1] + slack)
 
 
-class Series(_Measured):
-    """A quantity measured against time, anything that a state says; between steps it is interpolated linearly.
-
-    Args:
-        times: when it was measured [s], shape (f,), growing, from 0 to the experiment's t1.
-        data: what was measured, shape (f, ...); NaN or masked where nothing was.
-        of: function of (scene, particles) that returns it, shape (...).
-        sigma: standard deviation of the noise, in the unit of the data; None to estimate it.
-        weight: factor of the squares.
-        robust: misfit in standard deviations beyond which squares grow but linearly.
-        name: what tables and pictures call it.
-        shown: how pictures show it, such as in other units.
-    """
+class AbstractTimed(_Measured):
+    """A measurement against time; between steps it is interpolated linearly."""
 
     times: Float[np.ndarray, "f"] = eqx.field(converter=as_floats)
     data: Float[np.ndarray, "f ..."] = eqx.field(converter=as_floats)
-    of: Callable[[Scene, Particles], Any]
-    name: str = eqx.field(static=True, default="series", kw_only=True)
 
     def __check_init__(self):
         require_fields(self)
@@ -117,10 +104,7 @@ class Series(_Measured):
     def against(self) -> tuple[str, np.ndarray]:
         return "time [s]", self.times
 
-    def observe(self, scene: Scene, particles: Particles) -> Any:
-        return self.of(scene, particles)
-
-    def predict(self, seen: Array, run: Run) -> Array:
+    def predict(self, seen: Any, run: Run) -> Array:
         return self._at_times(seen, run)
 
     def _at_times(self, values: Array, run: Run, first: Scalar = 0.0) -> Array:
@@ -131,16 +115,6 @@ class Series(_Measured):
         outside = outside.reshape(-1, *[1] * (values.ndim - 1))
         return jnp.where(outside, jnp.nan, between(values, step - first))
 
-    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
-        self._check_times(t1)
-        seen = eqx.filter_eval_shape(lambda *state: self.observe(*state), scene, particles)
-        shape = getattr(seen, "shape", None)
-        require(
-            shape == self.data.shape[1:],
-            f"{self.title} has data of shape {self.data.shape[1:]} at each time, but of "
-            f"returns {'no array' if shape is None else f'shape {shape}'}.",
-        )
-
     def _check_times(self, t1: float) -> None:
         outside = (self.times < 0) | after(self.times, t1)
         require(
@@ -149,7 +123,7 @@ class Series(_Measured):
             f"first {self.times[outside][:1]}: raise t1, or leave them out.",
         )
 
-    def part_until(self, t1: float) -> "Series | None":
+    def part_until(self, t1: float) -> "AbstractTimed | None":
         kept = ~after(self.times, t1)
         if not np.isfinite(self.data[kept]).any():
             return None
@@ -164,80 +138,91 @@ class Series(_Measured):
         require(reached, f"A parameter moves times of {self.name!r} out of the run: raise t1.")
 
 
-class Tracks(Series):
+class Series(AbstractTimed):
+    """A quantity measured against time, anything that a state says; between steps it is interpolated linearly.
+
+    Args:
+        times: when it was measured [s], shape (f,), growing, from 0 to the experiment's t1.
+        data: what was measured, shape (f, ...); NaN or masked where nothing was.
+        of: function of (scene, particles) that returns it, shape (...).
+        sigma: standard deviation of the noise, in the unit of the data; None to estimate it.
+        weight: factor of the squares.
+        robust: misfit in standard deviations beyond which squares grow but linearly.
+        name: what tables and pictures call it.
+        shown: how pictures show it, such as in other units.
+    """
+
+    of: Callable[[Scene, Particles], Any]
+    name: str = eqx.field(static=True, default="series", kw_only=True)
+
+    def observe(self, scene: Scene, particles: Particles) -> Any:
+        return self.of(scene, particles)
+
+    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
+        self._check_times(t1)
+        seen = eqx.filter_eval_shape(lambda *state: self.observe(*state), scene, particles)
+        shape = getattr(seen, "shape", None)
+        require(
+            shape == self.data.shape[1:],
+            f"{self.title} has data of shape {self.data.shape[1:]} at each time, but of "
+            f"returns {'no array' if shape is None else f'shape {shape}'}.",
+        )
+
+
+class Tracks(AbstractTimed):
     """Places of material points that were followed: markers, or features of a video.
 
     Args:
         times: when they were seen [s], shape (f,), growing.
-        positions: where [m], shape (f, m, d); NaN where a marker was not seen.
+        data: where [m], shape (f, m, d); NaN where a marker was not seen.
         which: the markers: numbers of particles, shape (m,), or `Markers.at` for places between particles.
-        sigma, weight, robust, name: see `Series`.
+        sigma, weight, robust, name, shown: see `Series`.
     """
 
-    def __init__(
-        self,
-        times: Numbers,
-        positions: Numbers,
-        *,
-        which: Markers | np.ndarray | Array | list[int] | tuple[int, ...],
-        sigma: Numbers | None = None,
-        weight: Scalar = 1.0,
-        robust: Scalar | None = None,
-        name: str = "tracks",
-    ):
-        markers = which if isinstance(which, Markers) else Markers.of(which)
-        super().__init__(times, positions, markers, sigma=sigma, weight=weight, robust=robust, name=name)
+    which: Markers = eqx.field(converter=Markers.of, kw_only=True)
+    name: str = eqx.field(static=True, default="tracks", kw_only=True)
 
     def __check_init__(self):
         require_fields(self)
-        assert isinstance(self.of, Markers)
         require(
-            self.data.ndim == 3 and self.of.count == self.data.shape[1],
+            self.data.ndim == 3 and self.which.count == self.data.shape[1],
             f"{self.title} need positions of shape (f, m, d) of the m markers, got {self.data.shape} and "
-            f"{self.of.count} markers.",
+            f"{self.which.count} markers.",
         )
 
+    def observe(self, scene: Scene, particles: Particles) -> Array:
+        return self.which(scene, particles)
+
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
+        self._check_times(t1)
         require(
             self.data.shape[2] == particles.dim,
             f"{self.title} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.",
         )
-        super().check(scene, particles, t1)
-        assert isinstance(self.of, Markers)
-        self.of.check(self.name, particles.count)
+        self.which.check(self.name, particles.count)
 
 
-class Force(Series):
+class Force(AbstractTimed):
     """The force on a collider, such as a plate on which a body falls, or on any boundary, against time.
 
     Compared with the force of each step at its own time (see `Forces`), interpolated linearly.
 
     Args:
         times: when it was measured [s], shape (f,), growing.
-        forces: the force [N], shape (f, d); NaN where a component was not measured.
+        data: the force [N], shape (f, d); NaN where a component was not measured.
         collider: number of the collider, from 0, in the order of the scene's boundaries.
         boundary: in its place, number of the boundary, in the scene's order. The scene must have `boundary_forces`.
-        sigma, weight, robust, name: see `Series`.
+        sigma, weight, robust, name, shown: see `Series`.
     """
 
-    collider: int = eqx.field(static=True)
-    boundary: int | None = eqx.field(static=True)
+    collider: int = eqx.field(static=True, default=0, kw_only=True)
+    boundary: int | None = eqx.field(static=True, default=None, kw_only=True)
+    name: str = eqx.field(static=True, default="force", kw_only=True)
     _component: ClassVar = "force"
 
-    def __init__(
-        self,
-        times: Numbers,
-        forces: Numbers,
-        *,
-        collider: int = 0,
-        boundary: int | None = None,
-        sigma: Numbers | None = None,
-        weight: Scalar = 1.0,
-        robust: Scalar | None = None,
-        name: str = "force",
-    ):
-        self.collider, self.boundary = collider, boundary
-        super().__init__(times, forces, _nothing, sigma=sigma, weight=weight, robust=robust, name=name)
+    def observe(self, scene: Scene, particles: Particles) -> Array:
+        """A zero: nothing is needed of the states."""
+        return jnp.zeros((), particles.x.dtype)
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         self._check_times(t1)  # the forces' shape is checked when they are predicted
@@ -268,11 +253,6 @@ class Torque(Force):
     three, about the centre of the collider's rotation, else its shape's middle, a grip's middle, or the origin."""
 
     _component: ClassVar = "torque"
-
-
-def _nothing(scene: Scene, particles: Particles) -> Array:
-    """A zero: nothing is needed of the states."""
-    return jnp.zeros((), particles.x.dtype)
 
 
 def between(values: Array, place: Array) -> Array:

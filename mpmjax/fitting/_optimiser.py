@@ -64,65 +64,50 @@ class LevenbergMarquardt(AbstractOptimiser):
     def directed(
         self, before: Search, z: Coordinates, state: "DampedState", seen: Evaluation
     ) -> tuple[Coordinates, "DampedState", Evaluation]:
-        reach, refused, longest, tolerance = float(state.reach), 0, np.inf, float(self.rtol)
-        settled = stalled = False
+        reach, refused, longest, settled, stalled = float(state.reach), 0, np.inf, False, False
         if before.history:
-            (last, J), (r, _) = _exact(before.seen), _exact(seen)
-            moved = np.asarray(z - before.z, float)
-            # Near a bound the quadratic, of coordinates, may foretell a step uphill: none is taken.
-            foretold = min(((last + J @ moved) ** 2).sum() - (last**2).sum(), 0.0)
-            change = (r**2).sum() - (last**2).sum()
-            if change <= _LEAST_RATIO * foretold:
-                reach *= _LONGER if change < _GOOD_RATIO * foretold < 0 else 1
-                changes, sizes = np.append(moved, r - last), np.abs(np.append(z, r))
-                settled = bool((np.abs(changes) < tolerance * (1 + sizes)).all())
+            last, tried, moved = _Lines.at(before.seen), _Lines.at(seen), np.asarray(z - before.z, float)
+            growth = _growth(last, tried, moved)
+            reach *= growth
+            if growth >= 1:
+                changes, sizes = np.append(moved, tried.r - last.r), np.abs(np.append(z, tried.r))
+                settled = bool((np.abs(changes) < float(self.rtol) * (1 + sizes)).all())
             else:
-                z, seen, reach, refused = before.z, before.seen, reach / _SHORTER, int(state.refused) + 1
+                z, seen, refused = before.z, before.seen, int(state.refused) + 1
                 longest = np.abs(moved).max() / _SHORTER if refused > 1 else np.inf
-            lately, freedom = before.history[-_LATELY:], max(len(r) - len(moved), 1)
-            often = len(lately) == _LATELY and sum(not i.accepted for i in lately) >= _LATELY / 2
-            near = bool((np.abs(z - lately[0].z) <= _NOWHERE).all())
-            gained = 2 * lately[0].cost - min((r**2).sum(), (last**2).sum())
-            stalled = often and near and gained <= max(_SLOW / freedom, _LITTLE**2) * (last**2).sum()
-        r, J = _exact(seen)
-        if not np.isfinite(J).all():
+            stalled = _leads_nowhere(before, z, last, min(tried.square, last.square))
+        lines = _Lines.at(seen)
+        if not np.isfinite(lines.J).all():
             return z, state, seen
-        U, lengths, Vt = np.linalg.svd(J, full_matrices=False)
-        damping = 1 / np.clip(reach, *_REACHES)
-        damping = np.append(damping, np.maximum(damping, lengths[0] ** 2 * np.logspace(-16, 8, 97)))
-        steps = -Vt.T @ ((lengths * (U.T @ r))[:, None] / (lengths[:, None] ** 2 + damping))
-        bent = np.isfinite(np.asarray(seen.room)).any(axis=0)  # coordinates of numbers with a bound
-        furthest = np.minimum(np.where(bent, _FURTHEST / _SHORTER**refused, np.inf), longest)[:, None]
-        short = (np.abs(steps) <= furthest).all(axis=0)
-        step = steps[:, short.argmax() if short.any() else -1]
-        wanted = np.abs(np.linalg.lstsq(J, -r)[0]).max()
-        held = wanted > _FAR * tolerance and (stalled or np.abs(step).max() < _REFUSED * wanted)
+        bent = np.isfinite(lines.room).any(axis=0)  # coordinates of numbers with a bound
+        step = _damped(lines, reach, np.minimum(np.where(bent, _FURTHEST / _SHORTER**refused, np.inf), longest))
+        wanted = np.abs(np.linalg.lstsq(lines.J, -lines.r)[0]).max()
+        held = wanted > _FAR * float(self.rtol) and (stalled or np.abs(step).max() < _REFUSED * wanted)
         over = settled or stalled
-        if not refused and (straight := _to_a_bound(seen, step)) is not None:
+        if not refused and (straight := _to_a_bound(lines, step)) is not None:
             # If it is refused, damped steps go on as if it had not been tried.
             step, reach = straight, reach * _SHORTER
         after = np.asarray(z, float) + step, reach, refused, over and not held, over and held
-        kinds = (leaf.dtype for leaf in state)
-        return z, DampedState(*map(jnp.asarray, after, kinds)), seen
+        return z, DampedState(*(jnp.asarray(a, leaf.dtype) for a, leaf in zip(after, state, strict=True))), seen
 
     def has_converged(self, state: "DampedState", seen: Evaluation) -> bool:
         if state.settled or self.distance(state, seen) <= 1:
             return True
         # Refused, and what it could have lowered Σ r² by is lost in the rounding, or a tenth of a standard error away.
-        r, J, step, _ = _gauss_newton(seen)
+        lines = _Lines.at(seen)
         rounding = _ROUNDINGS * float(np.finfo(np.asarray(seen.residuals).dtype).eps)
-        share = max(rounding, _LITTLE / max(len(r) - len(step), 1))
-        return bool(state.refused > 0 and ((r + J @ step) ** 2).sum() >= (1 - share) * (r**2).sum())
+        share = max(rounding, _LITTLE / max(lines.freedom, 1))
+        return bool(state.refused > 0 and lines.after(lines.gauss_newton()[0]) >= (1 - share) * lines.square)
 
     def distance(self, state: "DampedState", seen: Evaluation) -> float:
-        r, J, step, limited = _gauss_newton(seen)
-        rows, columns = J.shape
-        if rows <= columns or not np.isfinite(step).all():
+        lines = _Lines.at(seen)
+        step, limited = lines.gauss_newton()
+        if lines.freedom <= 0 or not np.isfinite(step).all():
             return float("nan")
-        error = np.sqrt((r**2).sum() / (rows - columns))
+        error = np.sqrt(lines.square / lines.freedom)
         # Data without noise leave no error to compare with: towards a bound the tolerance of residuals ends it.
         least = float(self.rtol) if limited.any() and np.abs(step[~limited]).max(initial=0) <= self.rtol else 0.0
-        length = float(np.linalg.norm(J @ step))
+        length = float(np.linalg.norm(lines.J @ step))
         return length / max(_NEGLIGIBLE * float(error), least) if length > 0 else 0.0
 
 
@@ -136,44 +121,90 @@ class DampedState(NamedTuple):
     stalled: Bool[Array, ""]  # whether it leads nowhere: the misfit has a kink, or simulations fail beyond
 
 
-def _exact(seen: Evaluation) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals and Jacobian in double precision."""
-    return np.asarray(seen.residuals, float), np.asarray(seen.jacobian, float)
+class _Lines(NamedTuple):
+    """Residuals as straight lines in the coordinates, r + J Δ, in double precision."""
+
+    r: np.ndarray
+    J: np.ndarray
+    room: np.ndarray  # see `FitProblem.room`
+
+    @classmethod
+    def at(cls, seen: Evaluation) -> "_Lines":
+        """Lines at a place."""
+        return cls(*(np.asarray(a, float) for a in (seen.residuals, seen.jacobian, seen.room)))
+
+    @property
+    def square(self) -> float:
+        """Σ r²."""
+        return (self.r**2).sum()
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom m − n."""
+        return self.J.shape[0] - self.J.shape[1]
+
+    def after(self, step: np.ndarray) -> float:
+        """Σ r² after a step."""
+        return ((self.r + self.J @ step) ** 2).sum()
+
+    def gauss_newton(self) -> tuple[np.ndarray, np.ndarray]:
+        """The next Gauss-Newton step, were values straight lines in their coordinates up to their bounds, NaN if it is
+        unknown, and which coordinates it brings to a bound."""
+        r, J, room = self
+        if not (np.isfinite(r).all() and np.isfinite(J).all()):
+            return np.full(J.shape[1], np.nan), np.zeros(J.shape[1], bool)
+        length = np.where((norm := np.linalg.norm(J, axis=0)) > 0, norm, 1)
+        down, up = room * length
+        step = np.linalg.lstsq(J / length, -r, rcond=1e-10)[0]
+        if ((step <= -down) | (step >= up)).any():
+            from scipy.optimize import lsq_linear  # here, since it takes long to import
+
+            step = lsq_linear(J / length, -r, (-down, up), method="bvls").x
+        return step / length, np.asarray((step <= -down) | (step >= up))
 
 
-def _to_a_bound(seen: Evaluation, damped: np.ndarray) -> np.ndarray | None:
+def _growth(last: _Lines, tried: _Lines, moved: np.ndarray) -> float:
+    """The factor of the reach after a step, by its part of the foretold decrease; below one the step is refused."""
+    # Near a bound the quadratic, of coordinates, may foretell a step uphill: none is taken.
+    foretold, change = min(last.after(moved) - last.square, 0.0), tried.square - last.square
+    if not change <= _LEAST_RATIO * foretold:
+        return 1 / _SHORTER
+    return _LONGER if change < _GOOD_RATIO * foretold < 0 else 1.0
+
+
+def _leads_nowhere(before: Search, z: Coordinates, last: _Lines, lowest: float) -> bool:
+    """Whether the latest iterations, half of them refused, have hardly moved, nor lowered Σ r² to its `lowest`."""
+    lately = before.history[-_LATELY:]
+    often = len(lately) == _LATELY and sum(not i.accepted for i in lately) >= _LATELY / 2
+    near = bool((np.abs(z - lately[0].z) <= _NOWHERE).all())
+    slow = max(_SLOW / max(last.freedom, 1), _LITTLE**2) * last.square
+    return often and near and 2 * lately[0].cost - lowest <= slow
+
+
+def _damped(lines: _Lines, reach: float, furthest: np.ndarray) -> np.ndarray:
+    """The step −(JᵀJ + λ)⁻¹ Jᵀ r with the smallest λ, one over the reach at least, that moves no coordinate further."""
+    U, lengths, Vt = np.linalg.svd(lines.J, full_matrices=False)
+    damping = 1 / np.clip(reach, *_REACHES)
+    damping = np.append(damping, np.maximum(damping, lengths[0] ** 2 * np.logspace(-16, 8, 97)))
+    steps = -Vt.T @ ((lengths * (U.T @ lines.r))[:, None] / (lengths[:, None] ** 2 + damping))
+    short = (np.abs(steps) <= furthest[:, None]).all(axis=0)
+    return steps[:, short.argmax() if short.any() else -1]
+
+
+def _to_a_bound(lines: _Lines, damped: np.ndarray) -> np.ndarray | None:
     """The Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds, where damping
     holds one beside a bound; else None."""
-    r, J, step, _ = _gauss_newton(seen)
-    if not np.isfinite(step).all():
-        return None
-    left, freedom = ((r + J @ step) ** 2).sum(), len(r) - len(step)
-    limit = _HIDDEN**2 * left / max(freedom, 1)  # of Δχ², by which chance puts a minimum beyond a bound
-    if freedom <= 0 or (r**2).sum() - left > limit * len(step):
-        return None  # Σ r² is no noise yet, and says nothing of errors
-    (down, up), square = np.asarray(seen.room, float), np.maximum((J**2).sum(axis=0), np.finfo(float).tiny)
+    step = lines.gauss_newton()[0]
+    left = lines.after(step)
+    limit = _HIDDEN**2 * left / max(lines.freedom, 1)  # of Δχ², by which chance puts a minimum beyond a bound
+    if not (lines.freedom > 0 and lines.square - left <= limit * len(step)):
+        return None  # there is no step, or Σ r² is no noise yet, and says nothing of errors
+    (down, up), square = lines.room, np.maximum((lines.J**2).sum(axis=0), np.finfo(float).tiny)
     near = square * np.minimum(down, up) ** 2 <= limit
     side = np.where(down < up, 1, -1)
     straight = side * np.minimum(np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1)), _LEAP)
     wanted = np.where(near, straight, step)
     return wanted if (near & (np.abs(damped) < np.abs(wanted) / 2)).any() else None
-
-
-def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """r, J, the next Gauss-Newton step, were values straight lines in their coordinates up to their bounds, NaN if it
-    is unknown, and which coordinates it brings to a bound."""
-    r, J = _exact(seen)
-    if not (np.isfinite(r).all() and np.isfinite(J).all()):
-        return r, J, np.full(J.shape[1], np.nan), np.zeros(J.shape[1], bool)
-    length = np.linalg.norm(J, axis=0)
-    length = np.where(length > 0, length, 1)
-    down, up = np.asarray(seen.room, float) * length
-    step = np.linalg.lstsq(J / length, -r, rcond=1e-10)[0]
-    if ((step <= -down) | (step >= up)).any():
-        from scipy.optimize import lsq_linear  # here, since it takes long to import
-
-        step = lsq_linear(J / length, -r, (-down, up), method="bvls").x
-    return r, J, step / length, (step <= -down) | (step >= up)
 
 
 class LBFGS(AbstractOptimiser):

@@ -13,7 +13,7 @@ import numpy as np
 from mpmjax._types import Array, Float
 from mpmjax.checks import checked, positive, require, warn, whole
 from mpmjax.fitting._estimate import VALUE, AbstractFit, Estimate, table
-from mpmjax.fitting._experiment import Experiment, Numbers
+from mpmjax.fitting._experiment import Experiment, Numbers, fits
 from mpmjax.fitting._fit import Level
 from mpmjax.fitting._problem import Coordinates, FitProblem, linearised
 from mpmjax.fitting._result import FitResult
@@ -69,13 +69,10 @@ def predict(
         raise ValueError(
             "What is predicted has no derivative by forward mode: give the runs in it adjoint=diffrax.ForwardMode()."
         ) from None
-    noise = None
-    if sigma is not None:
-        try:
-            noise = np.broadcast_to(np.asarray(sigma, float), value.shape)
-        except ValueError:
-            fault = f"predict's sigma must fit what is predicted, of shape {value.shape}, got shape {np.shape(sigma)}."
-            raise ValueError(fault) from None
+    noise: Any = None if sigma is None else np.asarray(sigma, float)
+    fault = f"predict's sigma must fit what is predicted, of shape {value.shape}, got shape {np.shape(noise)}."
+    require(fits(noise, value.shape), fault)
+    noise = None if noise is None else np.broadcast_to(noise, value.shape)
     return banded(result.uncertainty, level, value, J, noise)
 
 
@@ -120,10 +117,7 @@ def predict_observations(
     for number, (value, J, o, sigma) in enumerate(each):
         # The noise of new measurements is the observation's own, or that of the fitted one.
         sigma = np.asarray(sigma if o.sigma is None else o.sigma, float)
-        try:
-            noise = np.broadcast_to(sigma, np.shape(value))
-        except ValueError:
-            noise = np.full(np.shape(value), np.sqrt((sigma**2).mean()))
+        noise = np.broadcast_to(sigma if fits(sigma, value.shape) else np.sqrt((sigma**2).mean()), value.shape)
         predictions.append(banded(result.uncertainty, level, value, J, noise, number))
     return tuple(predictions)
 
@@ -180,7 +174,7 @@ def bootstrap(
     *,
     repeats: Annotated[int, whole(2)] = 200,
     seed: Annotated[int, whole(0)] = 0,
-    batch: int | None = None,
+    batch: Annotated[int, whole(1)] | None = None,
     optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Bootstrap:

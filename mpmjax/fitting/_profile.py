@@ -1,7 +1,7 @@
 """Profile likelihoods: intervals that need no straight line."""
 
-from collections.abc import Callable
-from typing import Annotated
+from collections.abc import Callable, Iterator
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -97,151 +97,32 @@ def profile(
     Raises:
         ValueError: there is no such fitted number; a level that is none.
     """
-    problem, sigmas, dtype = result.problem, result.sigmas, result.problem.dtype
-    require(label in problem.labels, f"A profile is of a fitted number: {', '.join(problem.labels)}. Got {label!r}.")
+    problem, names = result.problem, result.problem.labels
+    require(label in names, f"A profile is of a fitted number: {', '.join(names)}. Got {label!r}.")
     level = float(result.level if level is None else level)
-    at, optimiser = problem.labels.index(label), result.optimiser if optimiser is None else optimiser
-    unit, errors = np.eye(problem.size)[at], result.uncertainty
+    path = _Path(result, names.index(label), result.optimiser if optimiser is None else optimiser, progress)
+    at, errors = path.at, result.uncertainty
     # By the noise alone √Δχ² is one at a standard error; the threshold is as much farther as the misfit widens that.
     wider = result.estimates[at].error / result.estimates[at].noise_error
     wider = wider if np.isfinite(wider) else 1.0
-    freedom, error = float(errors.of(unit)[1]), float(errors.error[at]) / wider
+    freedom = float(errors.of(np.eye(problem.size)[at])[1])
     reach = float(quantile(level, freedom)) * wider
+    ends = [_walk(path, side, reach, points, float(errors.error[at]) / wider, float(rtol)) for side in (-1, 1)]
 
-    def numbers(z: np.ndarray) -> np.ndarray:
-        return np.asarray(problem.numbers(jnp.asarray(z, dtype)), float)
-
-    def value(place: float) -> float:
-        """The number where its coordinate is at a place, which may be infinite."""
-        return float(numbers(np.where(unit == 1, place, start[0]))[at])
-
-    def misfit(z: np.ndarray) -> float:
-        return 2 * float(costs_at(problem, z[None], sigmas, 1)[0])
-
-    def say(text: str) -> None:
-        texts.append(f"{label}: {text}")
-        warn(texts[-1])
-
-    start: _Point = np.asarray(result.z, float), 0.0
-    least, visited, unsettled, texts = misfit(start[0]), [start], 0, list[str]()
-    # How the other coordinates follow this one when it is moved, by the covariance.
-    blind = errors.unseen.shape[1] and np.isinf(error)
-    along = errors.unseen @ (errors.unseen.T @ unit) if blind else errors.inverse @ unit
-    first_pace = error if np.isfinite(error) else min(float(errors.alone[at]), 1.0)
-    if np.isfinite(problem.room(jnp.asarray(result.z, dtype))[:, at]).any():
-        # Away from a bound, a step of the coordinate that moves the value by its standard error.
-        first_pace = float(np.log1p(first_pace))
-
-    def visit(place: float, last: _Point, before: _Point) -> _Point | None:
-        """The least misfit with the coordinate held at a place, from the line through two points, or along the
-        covariance from the fit; None where the simulation fails."""
-        nonlocal unsettled
-        covered = last[0][at] - before[0][at]
-        z = last[0] + (along / along[at] if covered == 0 else (last[0] - before[0]) / covered) * (place - last[0][at])
-        z[at] = place
-        if len(z) == 1:
-            square = misfit(z)
-        else:
-            basis = np.delete(np.eye(len(z)), at, axis=1)
-            held = problem.on_plane(z, basis)
-            end = search(held, optimiser, jnp.zeros(held.size, dtype), sigmas)
-            if end.interrupted:
-                raise KeyboardInterrupt
-            if end.failure:
-                return None
-            unsettled += not end.converged
-            z, square = z + basis @ np.asarray(end.z, float), float((np.asarray(end.seen.residuals, float) ** 2).sum())
-        if not np.isfinite(square):
-            return None
-        visited.append((z, square - least))
-        if progress is not None:
-            progress(f"profile of {label}: Δχ² {square - least:8.4g}  {problem.shown(z)}")
-        return visited[-1]
-
-    def crossing(below: _Point, above: _Point) -> tuple[float, _Point, float | None, float | None]:
-        """Where √Δχ² is `reach` between two points, by Brent's method, and Δχ² beyond if it jumps there; see `end`. A
-        value at which the simulation fails counts as beyond."""
-        from scipy.optimize import root_scalar  # here, since it takes long to import
-
-        tried: dict[float, _Point | None] = {below[0][at]: below, above[0][at]: above}
-
-        def excess(place: float) -> float:
-            if place not in tried:
-                tried[place] = visit(place, below, above)
-            point = tried[place]
-            return reach if point is None else _root(point) - reach
-
-        within = float(rtol) / 2 * abs(above[0][at] - start[0][at])
-        root = float(root_scalar(excess, method="brentq", bracket=(below[0][at], above[0][at]), xtol=within).root)
-        sides = ([p for p in tried if (excess(p) < 0) == inside] for inside in (True, False))
-        inner, outer = (min(side, key=lambda p: abs(p - root)) for side in sides)
-        last, beyond = tried[inner], tried[outer]
-        assert last is not None
-        if excess(outer) - excess(inner) < _JUMP * reach or abs(outer - inner) > 4 * within:
-            return root, last, None, None
-        if beyond is None:
-            return float(np.copysign(np.inf, outer - inner)), last, float(outer), None
-        return root, last, None, beyond[1]
-
-    def end(side: int) -> tuple[float, _Point, float | None, float | None]:
-        """Walk to one side until √Δχ² is beyond `reach`: the coordinate where it crosses, infinite if it does not; the
-        last point; the nearest coordinate at which the simulation fails, and Δχ² beyond a jump, if there are."""
-        farthest = max(_FARTHEST, 3 * reach * error) if np.isfinite(error) else _FARTHEST
-        before, last, pace, fault = start, start, first_pace, np.inf
-        for _ in range(_MOST_POINTS):
-            gone = float(abs(last[0][at] - start[0][at]))
-            wanted = gone + _BEYOND * reach / points * pace
-            wanted = (gone + fault) / 2 if wanted >= fault else min(wanted, farthest)
-            point = visit(start[0][at] + side * wanted, last, before)
-            if point is None:
-                fault = wanted
-                if fault - gone < _NEAR_FAULT * fault:
-                    break
-                continue
-            if _root(point) >= reach:
-                return crossing(last, point)
-            grown = _root(point) - _root(last)
-            longest = _FASTER * (wanted - gone) * points / reach
-            pace = min((wanted - gone) / grown, longest) if grown > 0 else longest
-            here, there, estimate = (numbers(z)[at] for z, _ in (point, last, start))
-            before, last = last, point
-            if wanted >= farthest or abs(here - there) <= _STILL * (wanted - gone) * abs(estimate):
-                break
-        return side * np.inf, last, float(start[0][at] + side * fault) if np.isfinite(fault) else None, None
-
-    ends = [end(side) for side in (-1, 1)]
-    for (place, (z, growth), fault, jump), where in zip(ends, ("below", "above"), strict=True):
-        if jump is not None:
-            say(
-                f"the interval ends {where} at {numbers(z)[at]:.5g}, where Δχ² jumps from {max(growth, 0):.2g} to "
-                f"{jump:.2g}: the simulation changes abruptly there, and not the data end it. See whether its step is "
-                "stable."
-            )
-        if np.isinf(place):
-            beyond = "" if fault is None else f" Beyond, at {value(fault):.5g}, the simulation fails."
-            say(
-                f"the interval is open {where}. At {numbers(z)[at]:.5g} Δχ² is {max(growth, 0):.2g}, less than "
-                f"{reach**2:.3g}: the data do not bound it.{beyond}"
-            )
-    z, growth = min(visited, key=lambda point: point[1])
-    if growth < -_BETTER:
-        say(
-            f"the profile found a misfit smaller by {-growth:.2g} at {numbers(z)[at]:.5g}: the fit is not at the least "
-            "one. Fit again from there."
-        )
-    if unsettled:
-        say(f"at {unsettled} points of the profile the others did not converge.")
-    path = sorted(visited, key=lambda point: point[0][at])
-    along_path, values = np.stack([numbers(z) for z, _ in path]), [value(place) for place, *_ in ends]
+    texts = [f"{label}: {text}" for text in _remarks(path, ends, reach)]
+    for text in texts:
+        warn(text)
+    visited = sorted(path.visited, key=lambda point: point[0][at])
+    numbers, values = np.stack([path.numbers(z) for z, _ in visited]), [path.value(end.place) for end in ends]
     pull = result.jacobian.T @ result.residuals * np.array([e.at_bound for e in result.estimates])
     symmetric = intervals(problem, jnp.asarray(result.z), errors, pull / wider**2, level)
     return Profile(
         label=label,
         unit=result.estimates[at].unit,
-        values=along_path[:, at],
-        statistic=np.array([growth for _, growth in path]),
-        numbers=along_path,
-        labels=problem.labels,
+        values=numbers[:, at],
+        statistic=np.array([growth for _, growth in visited]),
+        numbers=numbers,
+        labels=names,
         estimate=result.estimates[at].value,
         symmetric=(float(symmetric[0][at]), float(symmetric[1][at])),
         interval=(min(values), max(values)),
@@ -253,6 +134,156 @@ def profile(
 
 
 _Point = tuple[np.ndarray, float]  # all coordinates where one is held, the others fitted, shape (n,), and Δχ² there
+
+
+class _Path:
+    """The least misfit along one coordinate: what was visited of it so far."""
+
+    def __init__(
+        self, result: FitResult, at: int, optimiser: AbstractOptimiser, progress: Callable[[str], None] | None
+    ):
+        self.problem, self.sigmas, self.optimiser = result.problem, result.sigmas, optimiser
+        self.at, self.progress, self.uncertainty = at, progress, result.uncertainty
+        self.start: _Point = np.asarray(result.z, float), 0.0
+        self.least, self.visited, self.unsettled = self._misfit(self.start[0]), [self.start], 0
+        errors, unit = result.uncertainty, np.eye(self.problem.size)[at]
+        blind = errors.unseen.shape[1] and np.isinf(errors.error[at])
+        # how the other coordinates follow this one when it is moved, by the covariance
+        along = errors.unseen @ (errors.unseen.T @ unit) if blind else errors.inverse @ unit
+        self.along = along / along[at]
+
+    def numbers(self, z: np.ndarray) -> np.ndarray:
+        """All fitted numbers, (n,), of their coordinates."""
+        return np.asarray(self.problem.numbers(jnp.asarray(z, self.problem.dtype)), float)
+
+    def value(self, place: float) -> float:
+        """The number where its coordinate is at a place, which may be infinite."""
+        z = self.start[0].copy()
+        z[self.at] = place
+        return float(self.numbers(z)[self.at])
+
+    def pace(self, error: float) -> float:
+        """How far a first step goes: a standard error, in a bounded number's coordinate what moves the value by it."""
+        pace = error if np.isfinite(error) else min(float(self.uncertainty.alone[self.at]), 1.0)
+        room = self.problem.room(jnp.asarray(self.start[0], self.problem.dtype))[:, self.at]
+        return float(np.log1p(pace)) if np.isfinite(room).any() else pace
+
+    def _misfit(self, z: np.ndarray) -> float:
+        return 2 * float(costs_at(self.problem, z[None], self.sigmas, 1)[0])
+
+    def visit(self, place: float, last: _Point, before: _Point) -> _Point | None:
+        """The least misfit with the coordinate held at a place, from the line through two points, or along the
+        covariance from the fit; None where the simulation fails."""
+        at, problem = self.at, self.problem
+        covered = last[0][at] - before[0][at]
+        z = last[0] + (self.along if covered == 0 else (last[0] - before[0]) / covered) * (place - last[0][at])
+        z[at] = place
+        if len(z) == 1:
+            square = self._misfit(z)
+        else:
+            basis = np.delete(np.eye(len(z)), at, axis=1)
+            held = problem.on_plane(z, basis)
+            end = search(held, self.optimiser, jnp.zeros(held.size, problem.dtype), self.sigmas)
+            if end.interrupted:
+                raise KeyboardInterrupt
+            if end.failure:
+                return None
+            self.unsettled += not end.converged
+            z, square = z + basis @ np.asarray(end.z, float), float((np.asarray(end.seen.residuals, float) ** 2).sum())
+        if not np.isfinite(square):
+            return None
+        self.visited.append((z, square - self.least))
+        if self.progress is not None:
+            label = problem.labels[at]
+            self.progress(f"profile of {label}: Δχ² {square - self.least:8.4g}  {problem.shown(z)}")
+        return self.visited[-1]
+
+
+class _End(NamedTuple):
+    """Where a walk along a path ended."""
+
+    place: float  # the coordinate where √Δχ² crosses the threshold's; infinite if it does not
+    last: _Point  # the last point before
+    fault: float | None = None  # the nearest coordinate at which the simulation fails, if it does
+    jump: float | None = None  # Δχ² beyond a jump, if there is one
+
+
+def _walk(path: _Path, side: int, reach: float, points: int, error: float, rtol: float) -> _End:
+    """Walk to one side, in so many points or more, until √Δχ² is beyond `reach`."""
+    start, at = path.start, path.at
+    farthest = max(_FARTHEST, 3 * reach * error) if np.isfinite(error) else _FARTHEST
+    before, last, pace, fault = start, start, path.pace(error), np.inf
+    for _ in range(_MOST_POINTS):
+        gone = float(abs(last[0][at] - start[0][at]))
+        wanted = gone + _BEYOND * reach / points * pace
+        wanted = (gone + fault) / 2 if wanted >= fault else min(wanted, farthest)
+        point = path.visit(start[0][at] + side * wanted, last, before)
+        if point is None:
+            fault = wanted
+            if fault - gone < _NEAR_FAULT * fault:
+                break
+            continue
+        if _root(point) >= reach:
+            return _crossing(path, last, point, reach, rtol)
+        grown = _root(point) - _root(last)
+        longest = _FASTER * (wanted - gone) * points / reach
+        pace = min((wanted - gone) / grown, longest) if grown > 0 else longest
+        here, there, estimate = (path.numbers(z)[at] for z, _ in (point, last, start))
+        before, last = last, point
+        if wanted >= farthest or abs(here - there) <= _STILL * (wanted - gone) * abs(estimate):
+            break
+    return _End(side * np.inf, last, float(start[0][at] + side * fault) if np.isfinite(fault) else None)
+
+
+def _crossing(path: _Path, below: _Point, above: _Point, reach: float, rtol: float) -> _End:
+    """Where √Δχ² is `reach` between two points, by Brent's method. What fails to be simulated counts as beyond."""
+    from scipy.optimize import root_scalar  # here, since it takes long to import
+
+    at = path.at
+    tried: dict[float, _Point | None] = {below[0][at]: below, above[0][at]: above}
+
+    def excess(place: float) -> float:
+        if place not in tried:
+            tried[place] = path.visit(place, below, above)
+        point = tried[place]
+        return reach if point is None else _root(point) - reach
+
+    within = rtol / 2 * abs(above[0][at] - path.start[0][at])
+    root = float(root_scalar(excess, method="brentq", bracket=(below[0][at], above[0][at]), xtol=within).root)
+    sides = ([p for p in tried if (excess(p) < 0) == inside] for inside in (True, False))
+    inner, outer = (min(side, key=lambda p: abs(p - root)) for side in sides)
+    last, beyond = tried[inner], tried[outer]
+    assert last is not None
+    if excess(outer) - excess(inner) < _JUMP * reach or abs(outer - inner) > 4 * within:
+        return _End(root, last)
+    if beyond is None:
+        return _End(float(np.copysign(np.inf, outer - inner)), last, fault=float(outer))
+    return _End(root, last, jump=beyond[1])
+
+
+def _remarks(path: _Path, ends: list[_End], reach: float) -> Iterator[str]:
+    """Warnings of an interval: ends that are none, a better minimum, searches that did not end."""
+    for (place, (z, growth), fault, jump), where in zip(ends, ("below", "above"), strict=True):
+        number = path.numbers(z)[path.at]
+        if jump is not None:
+            yield (
+                f"the interval ends {where} at {number:.5g}, where Δχ² jumps from {max(growth, 0):.2g} to {jump:.2g}: "
+                "the simulation changes abruptly there, and not the data end it. See whether its step is stable."
+            )
+        if np.isinf(place):
+            beyond = "" if fault is None else f" Beyond, at {path.value(fault):.5g}, the simulation fails."
+            yield (
+                f"the interval is open {where}. At {number:.5g} Δχ² is {max(growth, 0):.2g}, less than "
+                f"{reach**2:.3g}: the data do not bound it.{beyond}"
+            )
+    z, growth = min(path.visited, key=lambda point: point[1])
+    if growth < -_BETTER:
+        yield (
+            f"the profile found a misfit smaller by {-growth:.2g} at {path.numbers(z)[path.at]:.5g}: the fit is not at "
+            "the least one. Fit again from there."
+        )
+    if path.unsettled:
+        yield f"at {path.unsettled} points of the profile the others did not converge."
 
 
 def _root(point: _Point) -> float:

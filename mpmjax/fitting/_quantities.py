@@ -26,7 +26,9 @@ class Markers(eqx.Module):
     @classmethod
     @checked
     def of(cls, which: Any) -> "Markers":
-        """Markers that are particles, by their numbers, shape (m,); a ValueError if these are not whole."""
+        """Markers that are particles, by their numbers, shape (m,); a ValueError if not whole. Markers stay."""
+        if isinstance(which, Markers):
+            return which
         numbers = np.asarray(which)
         require(
             numbers.ndim == 1 and numbers.size > 0 and np.issubdtype(numbers.dtype, np.integer),

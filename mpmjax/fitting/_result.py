@@ -11,7 +11,7 @@ import numpy as np
 
 from mpmjax._types import Array
 from mpmjax.checks import require
-from mpmjax.fitting._discretisation import CoarseGrid, changes_shown, unexplained
+from mpmjax.fitting._discretisation import CoarseGrid, unexplained
 from mpmjax.fitting._estimate import (
     IMPROBABLE,
     VALUE,
@@ -187,7 +187,9 @@ class FitResult(AbstractFit):
         chi += "" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}"
         who = f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations"
         lost = [] if self.converged else ["NOT CONVERGED: errors hold only at a minimum."]
-        lost += changes_shown(self.problem, self.z, self.moved)
+        if isinstance(self.moved, np.ndarray):
+            spacing, both = (self.problem.shown(place) for place in self.z + np.cumsum(self.moved, axis=0))
+            lost += [f"on twice the spacing: {spacing}", f"and with twice the step: {both}"]
         looked = [] if self.screening is None else ["", str(self.screening)]
         before = [*self.remarks, ""] if self.remarks else []
         return "\n".join([*before, first, *many, *body, "", *noise, "", chi, who, *lost, *self.warnings, *looked])
@@ -280,13 +282,11 @@ def fit_result(
         def value(z: Coordinates, of: Callable[[Experiment], Any] = of) -> Array:
             return jnp.asarray(of(problem.at(z)[0]))
 
-        number, start, both = float(value(z)), float(value(jnp.zeros_like(z))), []
-        for each in (errors, noise_alone):
-            error, freedom = each.of(np.asarray(jax.jacfwd(value)(z), float))
-            both.append((float(error), float(quantile(level, freedom) * error)))
-        reach = max(by for _, by in both), both[1][1]
-        ends, alone = ((number - by, number + by) for by in reach)
-        reported.append(Estimate(name, number, both[0][0], ends, "", start, False, both[1][0], alone))
+        number, start, along = float(value(z)), float(value(jnp.zeros_like(z))), jax.jacfwd(value)(z)
+        whole, alone = (banded(each, level, number, along) for each in (errors, noise_alone))
+        ends = float(min(whole.lower, alone.lower)), float(max(whole.upper, alone.upper))
+        by_noise = float(alone.error), (float(alone.lower), float(alone.upper))
+        reported.append(Estimate(name, number, float(whole.error), ends, "", start, False, *by_noise))
     degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
     texts = seen_together(problem.labels, errors, problem.logarithmic)
     if isinstance(moved, str):
@@ -369,7 +369,8 @@ def intervals(
 _MOST_ROWS = 12  # numbers of one parameter up to which each has a row of the table
 _SHAPES = {
     "a ramp": "show a ramp: look at the drift and the zero of what measured, and at loads and the start of the run",
-    "drifts": "drift: look at the law, at its damping, and for another minimum",
+    "drifts": "drift: look at law and damping, for another minimum, and at what was taken as known and may be fitted: "
+    "place and friction of a wall, velocity at the start, scale of a picture",
     "correlated": "are correlated: look at their picture, for a motion that law or grid miss, or smoothed data",
 }
 _EXACT = 1e-6  # misfit, in sizes of the data, below which data are exact

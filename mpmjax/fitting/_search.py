@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array
-from mpmjax.checks import require, require_fields, require_whole
+from mpmjax.checks import require, require_fields
 from mpmjax.fitting._evaluation import Evaluation, evaluated, parts_kept
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 
@@ -261,7 +261,7 @@ def batch_size(problem: FitProblem, batch: int | None, count: int) -> int:
     less than one by one, and one with implicit ones, where all wait for the slowest solve (`benchmarks/multistart.py`).
     """
     if batch is not None:
-        return min(require_whole("batch", batch, 1), count)
+        return min(batch, count)
     return min(8 if all(e.method.is_explicit for e in problem.experiments) else 1, count)
 
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from mpmjax._types import Scalar
 from mpmjax.analysis import sensitivity
-from mpmjax.checks import checked, positive, require, require_positive, warn
+from mpmjax.checks import checked, positive, require, warn
 from mpmjax.fitting._estimate import VALUE, AbstractFit, Estimate, NoiseEstimate, table
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import Level, chosen_optimiser, fit, require_end
-from mpmjax.fitting._observation import Series
+from mpmjax.fitting._observation import AbstractTimed
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import FitResult
@@ -32,7 +32,7 @@ def fit_staged(
     experiments: Experiment | tuple[Experiment, ...] | list[Experiment],
     parameters: dict[str, AbstractParameter],
     *,
-    horizons: tuple[float, ...] | list[float] | None = None,
+    horizons: Annotated[tuple[float, ...] | list[float], positive, "s"] | None = None,
     growth: Scalar = 1e3,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Level = 0.95,
@@ -70,7 +70,6 @@ def fit_staged(
     require(float(growth) > 0, f"growth must be positive, or infinite to use all data, got {growth}.")
     if (times := None if horizons is None else [float(t) for t in horizons]) is not None:
         require(len(times) > 0, "horizons must hold a time at least; leave them out to have them chosen.")
-        require_positive("horizons [s]", np.array(times))
         require(all(a < b for a, b in pairwise(times)), f"horizons must grow, got {times}.")
     problem = FitProblem(experiments, parameters)
     optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
@@ -147,7 +146,7 @@ def _first_horizon(problem: FitProblem, z: Coordinates) -> float:
     if not np.isfinite(r).all():
         problem.explain(z)
     for o, rows, sigma in zip(problem.observations, problem.rows, sigmas, strict=True):
-        if isinstance(o, Series):
+        if isinstance(o, AbstractTimed):
             change = (J[rows] ** 2).reshape(len(o.times), -1, problem.size).sum(axis=1)
             data = o.data.reshape(len(o.times), -1)
             measured, spread = np.isfinite(data), np.broadcast_to(np.asarray(sigma), o.data.shape).reshape(data.shape)

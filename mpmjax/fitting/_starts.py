@@ -135,9 +135,15 @@ def look_around(
     apart, size = len(points) - len(shares), batch_size(problem, starts.batch, len(points))
     costs = np.zeros(len(points))
     if starts.fraction < 1:
-        told = counted(progress, "{} of {} simulations are done")
-        costs = costs_at(problem, points, sigmas, size, told)
+        costs = costs_at(problem, points, sigmas, size, counted(progress, "{} of {} simulations are done"))
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
+    remark = ""
+    if 2 * len(failures) > len(points):
+        try:
+            problem.explain(jnp.asarray(points[min(failures)], problem.dtype), _FAILS)
+        except (ValueError, RuntimeError) as cause:
+            failures[min(failures)] = str(cause)
+            remark = f"{len(failures)} of {len(points)} starts failed, the first since: {cause}"
     # A program that makes one iteration is compiled already.
     size = 1 if starts.if_needed and starts.batch is None else size
     together = partial(search_many, [(problem, sigmas)], optimiser, batch=size)
@@ -176,7 +182,7 @@ def look_around(
         )
         for end, numbers in groups
     )
-    ended, remark = {k for _, numbers in groups for k in numbers}, ""
+    ended = {k for _, numbers in groups for k in numbers}
     if minima and minima[0].searches == 1 and len(ended & members.keys()) > 1 and not starts.if_needed:
         remark = (
             f"The best minimum was found by one search of {len(members)}: there may be a better one. Take more starts, "
@@ -234,12 +240,10 @@ def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], start
     """Coordinates of the first guess, of the points of `starts`, and of points of the unit cube, its sides as its
     `ranges` say. The range of a positive parameter is one of its logarithm.
     """
-    ranges = dict(starts.ranges or {})
-    unknown = sorted(set(ranges) - set(problem.names))
-    require(not unknown, f"ranges must be of parameters ({', '.join(problem.names)}), got {', '.join(unknown)}.")
-    for number, point in enumerate(starts.points):
-        unknown = sorted(set(point) - set(problem.names))
-        require(not unknown, f"Start {number} must be of {', '.join(problem.names)}, got {', '.join(unknown)}.")
+    ranges, points = starts.ranges or {}, {f"Start {k}": point for k, point in enumerate(starts.points)}
+    for what, values in {"ranges": ranges, **points}.items():
+        unknown = sorted(set(values) - set(problem.names))
+        require(not unknown, f"{what} must be of parameters ({', '.join(problem.names)}), got {', '.join(unknown)}.")
     columns, column = [], 0
     for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
         share = shares[:, column : column + start.size].reshape(-1, *start.shape)
@@ -289,13 +293,8 @@ def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], frac
     """For each point the number of the one that stands for it, from which a search starts; its own where one starts
     there, and -1 where the cost is not finite.
 
-    One starts from each point that has no better one within the critical distance, any other is linked to the nearest
-    better one (multi-level single linkage). On a rough function that is too few: a fraction starts besides.
-
-    Args:
-        shares: the points, evenly spread over the unit cube.
-        costs: the function there; not finite where it fails.
-        fraction: of all points, the best ones, from which searches start besides; 1 for all.
+    This is multi-level single linkage (see `Starts`) of points that are evenly spread over the unit cube, `shares`. On
+    a rough function its starts are too few: a fraction of all points, the best ones, start besides.
     """
     count, size = shares.shape
     stands = np.full(count, -1)

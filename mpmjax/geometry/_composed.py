@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from functools import reduce
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Point, Scalar
-from mpmjax.checks import coordinates, require, require_fields, require_finite, require_that
+from mpmjax.checks import coordinates, finite, require, require_fields, require_that
 from mpmjax.geometry._motion import turn
 from mpmjax.geometry._region import AbstractRegion, Cells
 
@@ -120,10 +121,10 @@ class Placed(AbstractRegion):
     """
 
     region: AbstractRegion
-    mirror: Point | None = None
-    rotation: Scalar | Point | None = None
-    displacement: Point | None = None
-    centre: Point | None = None
+    mirror: Annotated[Point, finite] | None = None
+    rotation: Annotated[Scalar | Point, finite, "rad"] | None = None
+    displacement: Annotated[Point, finite, "m"] | None = None
+    centre: Annotated[Point, finite, "m"] | None = None
 
     def __check_init__(self):
         require_fields(self)
@@ -132,14 +133,12 @@ class Placed(AbstractRegion):
             if (vector := getattr(self, name)) is not None:
                 right = coordinates(f"A placed region's {name}", vector) == d
                 require(right, f"A placed region's {name} must have {d} coordinates, as the region has, got {vector}.")
-                require_finite(f"A placed region's {name}", vector)
         if self.mirror is not None:
             require_that("A placed region's mirror must not be zero", lambda a: (a != 0).any(), self.mirror)
         if self.rotation is not None:
             shape, expected = jnp.shape(jnp.asarray(self.rotation)), {2: (), 3: (3,)}.get(d)
             fault = "one angle in two dimensions, three numbers in three, none in one"
             require(shape == expected, f"A placed region's rotation must be {fault}; got {self.rotation} in {d}.")
-            require_finite("A placed region's rotation", self.rotation)
 
     @property
     def dim(self) -> int:

@@ -1,7 +1,7 @@
 """Prescribed motions. They are data, no callables: saved, differentiated and changed without compiling anew."""
 
 from functools import partial
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Point, Scalar
-from mpmjax.checks import Mark, coordinates, require, require_fields, require_finite, require_that, shape_of
+from mpmjax.checks import Mark, coordinates, finite, require, require_fields, require_finite, require_that, shape_of
 
-Times = Float[Array, "j"] | Float[np.ndarray, "j"] | tuple[float | int | Array, ...] | list[float | int | Array]
-Displacements = Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
+_Row = Float[Array, "j"] | Float[np.ndarray, "j"] | tuple[float | int | Array, ...] | list[float | int | Array]
+Times = Annotated[_Row, finite, "s"]
+Displacements = Annotated[Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list, finite, "m"]
 
 
 class AbstractMotion(eqx.Module):
@@ -111,8 +112,8 @@ class RigidMotion(AbstractMotion):
 
     times: Times
     displacement: Displacements
-    rotation: Times | Float[Array, "j r"] | Float[np.ndarray, "j r"] | tuple | list
-    centre: Point
+    rotation: Annotated[_Row | Float[Array, "j r"] | Float[np.ndarray, "j r"] | tuple | list, finite, "rad"]
+    centre: Annotated[Point, finite, "m"]
 
     def __check_init__(self):
         require_fields(self)
@@ -121,12 +122,10 @@ class RigidMotion(AbstractMotion):
         require(d in (2, 3), f"A rigid motion is two- or three-dimensional, got {d} coordinates: take a Motion.")
         expected = (len(self.times),) if d == 2 else (len(self.times), 3)
         require(shape == expected, f"A rigid motion's rotation must have shape {expected} here, got {shape}.")
-        require_finite("A rigid motion's rotation", self.rotation)
         require(
             coordinates("A rigid motion's centre", self.centre) == d,
             f"A rigid motion's centre must have {d} coordinates, as its displacement has, got {self.centre}.",
         )
-        require_finite("A rigid motion's centre", self.centre)
 
     def rests(self) -> bool:
         return _constant(self.displacement) and _constant(self.rotation)
@@ -179,8 +178,6 @@ def _check_rows(owner: str, values: str, times: Times, rows: Any, *, axes: tuple
         len(j) == 1 and len(shape) in axes and j[0] == shape[0] > 0,
         f"{owner} {values} must be one {kind} a time, one time at least, got shapes {j} and {shape}.",
     )
-    require_finite(f"{owner} times", times)
-    require_finite(f"{owner} {values}", rows)
     require_that(f"{owner} times must increase", lambda t: t[1:] > t[:-1], times)
 
 
@@ -239,7 +236,7 @@ class TimeSeries(eqx.Module):
     """
 
     times: Times
-    values: Times | Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
+    values: Annotated[_Row | Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list, finite]
 
     def __check_init__(self):
         require_fields(self)

@@ -6,14 +6,14 @@ mean. It is never NaN or zero, so that a collider acts on what is at its middle 
 """
 
 import abc
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Corner, Float, Point, Scalar
-from mpmjax.checks import coordinates, require, require_fields, require_finite, require_that
+from mpmjax.checks import coordinates, finite, require, require_fields, require_that
 
 Cells = tuple[np.ndarray, np.ndarray]
 """Centroids [m], shape (m, d), and volumes [m^d], shape (m,), of cells fitted to a body."""
@@ -136,8 +136,8 @@ class HalfSpace(AbstractRegion):
         normal: the direction out of the region, (d,), of any length.
     """
 
-    point: Point
-    normal: Point
+    point: Annotated[Point, finite, "m"]
+    normal: Annotated[Point, finite]
     flat: ClassVar[bool] = True
 
     def __check_init__(self):
@@ -146,8 +146,6 @@ class HalfSpace(AbstractRegion):
             coordinates("A half-space's point", self.point) == coordinates("A half-space's normal", self.normal),
             f"A half-space needs a point and a normal with as many coordinates, got {self.point} and {self.normal}.",
         )
-        require_finite("A half-space's point", self.point)
-        require_finite("A half-space's normal", self.normal)
         require_that("A half-space's normal must not be zero", lambda a: (a != 0).any(), self.normal)
 
     @property

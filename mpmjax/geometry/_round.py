@@ -1,13 +1,14 @@
 """Round regions: balls, rings, capsules, cylinders and tubes."""
 
 import itertools
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Point, Scalar
-from mpmjax.checks import coordinates, require, require_fields, require_finite, require_positive, require_that
+from mpmjax.checks import coordinates, finite, positive, require, require_fields, require_that
 from mpmjax.geometry._region import AbstractRegion, Cells, box_cells, common, from_axis, length
 
 
@@ -19,14 +20,12 @@ class Ball(AbstractRegion):
         radius: radius [m].
     """
 
-    centre: Point
-    radius: Scalar
+    centre: Annotated[Point, finite, "m"]
+    radius: Annotated[Scalar, positive, "m"]
 
     def __check_init__(self):
         require_fields(self)
         coordinates("A ball's centre", self.centre)
-        require_finite("A ball's centre", self.centre)
-        require_positive("A ball's radius", self.radius)
 
     @property
     def dim(self) -> int:
@@ -59,15 +58,14 @@ class Annulus(AbstractRegion):
         outer: outer radius [m].
     """
 
-    centre: Point
-    inner: Scalar
+    centre: Annotated[Point, finite, "m"]
+    inner: Annotated[Scalar, positive, "m"]
     outer: Scalar
 
     def __check_init__(self):
         require_fields(self)
         d = coordinates("An annulus's centre", self.centre)
         require(d == 2, f"An annulus has a centre of two coordinates, got {self.centre}: take a Tube in 3-D.")
-        require_finite("An annulus's centre", self.centre)
         _check_radii("An annulus", self.inner, self.outer)
 
     @property
@@ -106,8 +104,6 @@ class AbstractRound(AbstractRegion):
             coordinates(f"{name}'s start", start) == coordinates(f"{name}'s end", end),
             f"{name} needs two ends with as many coordinates, got {start} and {end}.",
         )
-        require_finite(f"{name}'s start", start)
-        require_finite(f"{name}'s end", end)
         require_that(f"{name}'s ends must differ", lambda a, b: (a != b).any(), start, end)
 
     @property
@@ -127,13 +123,12 @@ class Capsule(AbstractRound):
         radius: radius [m].
     """
 
-    start: Point
-    end: Point
-    radius: Scalar
+    start: Annotated[Point, finite, "m"]
+    end: Annotated[Point, finite, "m"]
+    radius: Annotated[Scalar, positive, "m"]
 
     def __check_init__(self):
         require_fields(self)
-        require_positive("A capsule's radius", self.radius)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """‖x − nearest point of the segment‖ − radius."""
@@ -156,14 +151,13 @@ class Cylinder(AbstractRound):
         radius: radius [m].
     """
 
-    start: Point
-    end: Point
-    radius: Scalar
+    start: Annotated[Point, finite, "m"]
+    end: Annotated[Point, finite, "m"]
+    radius: Annotated[Scalar, positive, "m"]
 
     def __check_init__(self):
         require_fields(self)
         require(len(self.start) > 1, f"A cylinder has two or three coordinates, got {self.start}: take a Box.")
-        require_positive("A cylinder's radius", self.radius)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """As for a box, from the distances to the ends and to the lateral surface."""
@@ -201,9 +195,9 @@ class Tube(AbstractRound):
         outer: outer radius [m].
     """
 
-    start: Point
-    end: Point
-    inner: Scalar
+    start: Annotated[Point, finite, "m"]
+    end: Annotated[Point, finite, "m"]
+    inner: Annotated[Scalar, positive, "m"]
     outer: Scalar
 
     def __check_init__(self):
@@ -230,7 +224,6 @@ class Tube(AbstractRound):
 
 
 def _check_radii(name: str, inner: Scalar, outer: Scalar) -> None:
-    require_positive(f"{name}'s inner radius", inner)
     require_that(f"{name}'s inner radius must lie below its outer one", lambda a, b: a < b, inner, outer)
 
 

@@ -3,7 +3,7 @@
 import itertools
 import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,12 +12,12 @@ from mpmjax._types import Array, Float, Point, Scalar
 from mpmjax.checks import (
     checked,
     coordinates,
+    finite,
     is_traced,
+    positive,
     require,
     require_fields,
-    require_finite,
     require_memory,
-    require_positive,
     shape_of,
     shortened,
     warn,
@@ -31,6 +31,7 @@ _FIRST = 0.02
 """The first distance tried by which samples are moved, in spacings, so that the region has the shape's volume."""
 _SECANTS = 4  # steps of the secant method that finds this distance
 _ALIKE, _POOR = 1e-4, 5e-3  # relative errors of the volume at which the search ends, and beyond which it is warned of
+_Spacing = Annotated[float, positive, "m"]
 _PADDING = 3  # samples beyond the bounding box on each side: one and a half are the spline's
 
 
@@ -49,9 +50,11 @@ class SampledDistance(AbstractRegion):
             lattice must reach two spacings beyond the surface.
     """
 
-    lower: Point
-    spacing: Scalar
-    values: Float[Array, "a"] | Float[Array, "a b"] | Float[Array, "a b c"] | Float[np.ndarray, "..."] | list
+    lower: Annotated[Point, finite, "m"]
+    spacing: Annotated[Scalar, positive, "m"]
+    values: Annotated[
+        Float[Array, "a"] | Float[Array, "a b"] | Float[Array, "a b c"] | Float[np.ndarray, "..."] | list, finite, "m"
+    ]
 
     def __check_init__(self):
         require_fields(self)
@@ -61,9 +64,6 @@ class SampledDistance(AbstractRegion):
             f"SampledDistance needs as many coordinates as its values have axes, got {self.lower} and shape {shape}.",
         )
         require(min(shape) >= 4, f"SampledDistance needs at least 4 samples in each direction, got {shape}.")
-        require_finite("SampledDistance's lower corner", self.lower)
-        require_finite("SampledDistance's values", self.values)
-        require_positive("SampledDistance's spacing", self.spacing)
         inside = (jnp if is_traced(self.values) else np).asarray(self.values) < 0
         require(inside.any(), "SampledDistance's values must be negative somewhere: inside.")
 
@@ -99,7 +99,7 @@ class SampledDistance(AbstractRegion):
 
 
 @checked
-def sample_distance(region: AbstractRegion, spacing: float) -> SampledDistance:
+def sample_distance(region: AbstractRegion, spacing: _Spacing) -> SampledDistance:
     """Sample the signed distance of a bounded region.
 
     Args:
@@ -115,7 +115,9 @@ def sample_distance(region: AbstractRegion, spacing: float) -> SampledDistance:
 
 
 @checked
-def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float, *, scale: float = 1.0) -> SampledDistance:
+def sample_mesh(
+    mesh: str | Path | tuple[Any, Any], spacing: _Spacing, *, scale: Annotated[float, positive] = 1.0
+) -> SampledDistance:
     """Sample the signed distance from a closed surface of triangles. Needs the extra `mesh` (trimesh, rtree).
 
     Args:
@@ -133,7 +135,6 @@ def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float, *, scale: fl
         import trimesh  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError('A mesh needs trimesh and rtree: pip install "mpmjax[mesh]".') from error
-    require_positive("A mesh's scale", scale)
     if isinstance(mesh, tuple):
         shapes = [shape_of(part) for part in mesh]
         triangles = all(shape is not None and len(shape) == 2 and shape[1] == 3 for shape in shapes)
@@ -197,7 +198,6 @@ def _volume(region: AbstractRegion, values: np.ndarray, points: np.ndarray, spac
 
 def _lattice(lower: np.ndarray, upper: np.ndarray, spacing: float, hint: str = "") -> np.ndarray:
     """The points of a lattice around a bounding box, (..., d); `hint` ends what is said of one that is too large."""
-    require_positive("The samples' spacing [m]", spacing)
     require(
         np.isfinite(lower) & np.isfinite(upper), f"Only a region with bounds can be sampled, got {lower} to {upper}."
     )

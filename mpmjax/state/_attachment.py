@@ -3,7 +3,7 @@ step: how the nodes move them, and how forces on them reach the nodes."""
 
 import abc
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, NodeVector, Scalar
-from mpmjax.checks import is_traced, require, require_fields, require_positive, require_that, shape_of, warn
+from mpmjax.checks import is_traced, positive, require, require_fields, require_that, shape_of, warn
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.geometry import AbstractRegion, surface_pieces
 from mpmjax.material import AbstractLaw
@@ -113,12 +113,10 @@ class Patch(AbstractPlace):
 
     region: AbstractRegion
     within: AbstractRegion | None = None
-    spacing: Scalar | None = None
+    spacing: Annotated[Scalar, positive, "m"] | None = None
 
     def __check_init__(self):
         require_fields(self)
-        if self.spacing is not None:
-            require_positive("A Patch's spacing [m]", self.spacing)
         require(
             self.within is None or self.within.dim == self.region.dim,
             "A Patch's regions must have the same dimension, got "

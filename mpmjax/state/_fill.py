@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Point, Scalar
-from mpmjax.checks import checked, coordinates, is_traced, require, require_memory, require_positive, shortened
+from mpmjax.checks import checked, coordinates, is_traced, positive, require, require_memory, shortened
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractMotion, AbstractRegion, Box, box_cells, inside_parts
 from mpmjax.state._particles import Particles
@@ -27,7 +27,7 @@ def fill(
     grid: Grid,
     *,
     particles_per_cell: int | tuple[int, ...] | list[int] | None = None,
-    density: Scalar,
+    density: Annotated[Scalar, positive, "kg/m^d"],
     velocity: Velocity | None = None,
     dtype: type | str | None = None,
     fitted: bool = False,
@@ -60,7 +60,6 @@ def fill(
     """
     d = grid.dim
     precision = _precision(dtype)
-    require_positive("density [kg/m^d]", density)
     if particles_per_cell is None:
         counts = np.full(d, 2)
     elif isinstance(particles_per_cell, (int, np.integer)):
@@ -107,7 +106,7 @@ def fill_mapped(
     box: Box,
     counts: tuple[int, ...] | list[int],
     *,
-    density: Scalar,
+    density: Annotated[Scalar, positive, "kg/m^d"],
     velocity: Velocity | None = None,
     dtype: type | str | None = None,
     axisymmetric: bool = False,
@@ -135,7 +134,6 @@ def fill_mapped(
             a box without bounds.
     """
     d, precision = box.dim, _precision(dtype)
-    require_positive("density [kg/m^d]", density)
     number = _counts("counts must be", counts, d)
     field = _velocity(velocity, d)
     lower, upper = box.bounds()

@@ -1,7 +1,7 @@
 """The scene: everything that a step needs and does not change, with its description and its bodies."""
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,11 +11,11 @@ from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar, particle
 from mpmjax.boundary import AbstractBoundary, mirror, refuse_contact
 from mpmjax.checks import (
     as_plain,
+    between,
     checked,
     coordinates,
     is_traced,
     require,
-    require_between,
     require_fields,
     require_finite,
 )
@@ -83,12 +83,11 @@ class Bodies(eqx.Module):
         of_materials: the number of each material's body, from 0. Default: each material is a body.
     """
 
-    friction: Scalar = 0.0
+    friction: Annotated[Scalar, between(0, 1e6)] = 0.0
     of_materials: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     def __check_init__(self):
         require_fields(self)
-        require_between("The friction of Bodies", self.friction, 0, 1e6)
         require(
             self.of_materials is None or len(self.of_materials) > 0,
             "The of_materials of Bodies must be one number for each material, got none: leave it out to make each "

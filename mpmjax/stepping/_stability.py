@@ -2,7 +2,7 @@
 
 import math
 from itertools import combinations
-from typing import Literal
+from typing import Annotated, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeScalar, Scalar
 from mpmjax.boundary import STIFFNESS, AbstractContact, ConstrainedNodes, series_stiffness
-from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_positive
+from mpmjax.checks import canonical, checked, finite, is_traced, require, require_positive
 from mpmjax.discretisation import Stencil
 from mpmjax.geometry import length
 from mpmjax.potential import Mirror
@@ -36,7 +36,7 @@ def stable_dt(
     method: AbstractIntegrator = Explicit(),
     safety: Scalar = SAFETY,
     t1: Scalar | None = None,
-    t: Scalar = 0.0,
+    t: Annotated[Scalar, finite, "s"] = 0.0,
 ) -> Float[Array, ""]:
     """The longest step Δt [s] for which motion about the present state of the particles does not grow.
 
@@ -89,7 +89,6 @@ def stable_dt(
             that gives no bound; with t1, a bound that is zero or infinite.
     """
     require_positive("safety", safety, particles.x.dtype)
-    require_finite("t [s]", t)
     limit = canonical(safety, particles.x.dtype) * longest_step(scene, particles, method, t)
     if not is_traced(limit):
         require(

@@ -20,28 +20,61 @@ from mpmjax.io import replacing, save_figure
 _PROFILES_A_ROW = 3
 
 
-def draw_fit(
-    result: FitResult,
-    path: Path,
+def write_fit(
+    outcome: FitResult | RefinedFit,
+    picture: Path,
     measured: tuple[Experiment, ...] = (),
     profiles: tuple[Profile, ...] = (),
-    predictions: tuple[Prediction, ...] | None = None,
 ) -> Path:
-    """Data, the fitted simulation and its bands, residuals in units of the noise, the misfit of each iteration, and
-    profiles. `measured` are the fitted experiments with more data, or longer, which the fit predicts, `predictions`
-    those of them, where they are known already."""
+    """Write the picture of a fit, and beside it its numbers as JSON, the path of which is returned.
+
+    The picture has data, the fitted simulation and its bands, residuals in units of the noise, the misfit of each
+    iteration, and profiles; the numbers are estimates with errors and intervals, correlations, noise, χ², iterations,
+    predictions with bands, and profiles. Numbers that are not finite are null. Of a fit on several grids there are the
+    extrapolated estimates and those numbers of each grid; picture and profiles are of the finest, as `measured`: the
+    fitted experiments with more data, or longer, which the fit predicts.
+    """
+    *coarser, result = outcome.fits if isinstance(outcome, RefinedFit) else (outcome,)
+    measured = measured or result.experiments
+    predictions = predict_observations(result, measured)
+    _draw(result, picture, measured, profiles, predictions)
+    numbers = _numbers(result, measured, profiles, predictions)
+    if isinstance(outcome, RefinedFit):
+        before = [_numbers(each, each.experiments, (), predict_observations(each)) for each in coarser]
+        numbers = {
+            "estimates": [e._asdict() for e in outcome.estimates],
+            "error_from_noise": outcome.from_noise,
+            "error_from_discretisation": outcome.from_discretisation,
+            "order": outcome.order,
+            "refinements": outcome.refinements,
+            "fits": [*before, numbers],
+        }
+    text = json.dumps(numbers, default=lambda array: array.tolist())
+    plain = json.loads(text, parse_constant=lambda not_finite: None)
+    path = picture.with_suffix(".json")
+    with replacing(path) as aside:
+        aside.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path
+
+
+def _draw(
+    result: FitResult,
+    path: Path,
+    measured: tuple[Experiment, ...],
+    profiles: tuple[Profile, ...],
+    predictions: tuple[Prediction, ...],
+) -> None:
+    """Draw the picture of `write_fit`."""
     from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
 
-    shown = measured or result.experiments
-    predictions = predict_observations(result, measured or None) if predictions is None else predictions
-    observations = [o for e in shown for o in e.observations]
+    observations = [o for e in measured for o in e.observations]
     fitted = [o for e in result.experiments for o in e.observations]
     rows = len(observations) + 1 + -(-len(profiles) // _PROFILES_A_ROW)
     heights = [3.0] * len(observations) + [2.6] * (rows - len(observations))
     figure = plt.figure(figsize=(9.6, sum(heights)), layout="constrained")
     grid = figure.add_gridspec(rows, 6, height_ratios=heights)
     panels = [figure.add_subplot(grid[row, :4]) for row in range(len(observations))]
-    result.plot(panels, measured=shown, predictions=predictions)
+    result.plot(panels, measured=measured, predictions=predictions)
     for row, (observation, predicted, used) in enumerate(zip(observations, predictions, fitted, strict=True)):
         _draw_residuals(figure.add_subplot(grid[row, 4:]), observation, predicted, float(used.against[1].max()))
     row = len(observations)
@@ -70,7 +103,6 @@ def draw_fit(
         axis.spines[["top", "right"]].set_visible(False)
     save_figure(figure, path, 140)
     plt.close(figure)
-    return path
 
 
 def _draw_residuals(axis: Any, observation: AbstractObservation, predicted: Prediction, last: float) -> None:
@@ -108,43 +140,13 @@ def _draw_profile(axis: Any, profile: Profile) -> None:
     axis.legend(fontsize=7, frameon=False, loc="upper center")
 
 
-def write_fit(
-    result: FitResult | RefinedFit,
-    path: Path,
-    measured: tuple[Experiment, ...] = (),
-    profiles: tuple[Profile, ...] = (),
-    predictions: tuple[Prediction, ...] | None = None,
-) -> Path:
-    """The numbers of a fit as JSON: estimates with errors and intervals, correlations, noise, χ², iterations,
-    predictions with bands, and profiles. Of a fit on several grids, the extrapolated estimates, and those numbers of
-    each grid, `measured` and profiles (see `draw_fit`) of the finest. Numbers that are not finite are null."""
-    if isinstance(result, RefinedFit):
-        *coarser, finest = result.fits
-        numbers: dict[str, Any] = {
-            "estimates": [e._asdict() for e in result.estimates],
-            "error_from_noise": result.from_noise,
-            "error_from_discretisation": result.from_discretisation,
-            "order": result.order,
-            "refinements": result.refinements,
-            "fits": [*(_numbers(each) for each in coarser), _numbers(finest, measured, profiles, predictions)],
-        }
-    else:
-        numbers = _numbers(result, measured, profiles, predictions)
-    text = json.dumps(numbers, default=lambda array: array.tolist())
-    plain = json.loads(text, parse_constant=lambda not_finite: None)
-    with replacing(path) as aside:
-        aside.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return path
-
-
 def _numbers(
     result: FitResult,
-    measured: tuple[Experiment, ...] = (),
-    profiles: tuple[Profile, ...] = (),
-    predictions: tuple[Prediction, ...] | None = None,
+    measured: tuple[Experiment, ...],
+    profiles: tuple[Profile, ...],
+    predictions: tuple[Prediction, ...],
 ) -> dict[str, Any]:
-    observations = [o for e in measured or result.experiments for o in e.observations]
-    predictions = predict_observations(result, measured or None) if predictions is None else predictions
+    """The numbers of a fit on one grid, see `write_fit`."""
     plain = ("chi_squared", "p_value", "degrees_of_freedom", "level", "converged", "interrupted")
     bands = ("value", "error", "lower", "upper", "sigma", "new_lower", "new_upper")
     of_profile = ("label", "interval", "threshold", "degrees_of_freedom", "level", "warnings")
@@ -159,7 +161,7 @@ def _numbers(
         "predictions": [
             {"name": o.name, "against": o.against[0], "x": o.against[1], "measured": o.data}
             | {name: getattr(p, name) for name in bands}
-            for o, p in zip(observations, predictions, strict=True)
+            for o, p in zip((o for e in measured for o in e.observations), predictions, strict=True)
         ],
         "profiles": [
             {name: getattr(p, name) for name in of_profile}

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax.analysis import FIELDS, smoothed, volume_ratio
-from mpmjax.checks import between, canonical, checked, require, require_between, require_memory
+from mpmjax.checks import between, canonical, checked, require, require_memory
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene, history_arrays
@@ -89,8 +89,8 @@ def render(
     can_be = path.suffix != ".mp4" or shutil.which("ffmpeg")
     require(can_be, "A .mp4 needs the program ffmpeg, which is not there: install it, or write a .gif.")
     require_memory(f"A picture of {dpi:g} dots an inch", 64 * 8 * 6 * dpi**2, "take a smaller dpi.")
-    require_between("view's azimuth [degrees]", view[0], -360, 360)
-    require_between("view's elevation [degrees]", view[1], 0.1, 90)
+    between(-360, 360)("view's azimuth [degrees]", view[0])
+    between(0.1, 90)("view's elevation [degrees]", view[1])
     shown = [len(run) - 1 if frame is None else frame % len(run)] if still else range(len(run))
     label, value = ("", lambda scene, q: np.full(q.count, np.nan)) if colour is None else quantities[colour]
     values = np.stack([np.asarray(value(run.scene, run.frame(i)), float) for i in shown])
