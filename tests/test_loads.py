@@ -482,7 +482,7 @@ def test_a_scene_file_attaches_its_loads(tmp_path):
     path = tmp_path / "loaded.toml"
     path.write_text(SCENE_FILE)
     file = read_scene_file(path)
-    for (scene, particles), count in ((file[:2], 6), (file.build(2), 12)):
+    for (scene, particles), count in (((file.scene, file.particles), 6), (file.build(2), 12)):
         traction, spring = scene.loads
         assert len(traction.on.weight) == count
         assert float(jnp.sum(jnp.asarray(traction.on.weight))) == pytest.approx(SIDE, rel=1e-12)
