@@ -211,6 +211,18 @@ def test_the_derivative_by_a_colliders_motion_with_a_fluid_is_that_of_difference
     assert_close(jax.jacfwd(speed)(at), jax.grad(speed)(at), 1e-9)
 
 
+@pytest.mark.parametrize("law", [mpm.Fluid(1e4), *thorough(mpm.NeoHookean(1e4, 0.3))])
+def test_a_drum_that_spins_leaves_what_slips_in_it_at_rest(law):
+    """Its surface stays where it is, however far a step turns it."""
+    centre, grid = (0.87, 0.83), mpm.Grid((28, 28), DX)
+    spin = mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.0, 0.0)), (0.0, 200.0), centre)
+    drum = SLIP(mpm.geometry.Complement(mpm.Ball(centre, 0.6)), spin)
+    body = mpm.fill(mpm.Ball(centre, 0.6), grid, density=WATER)
+    for method in (mpm.Explicit(), SEMI_IMPLICIT):
+        after, _ = mpm.step(mpm.Scene(grid, law, boundary=drum), body, 0.0, 2e-3, method=method)
+        assert float(jnp.abs(after.v).max()) < 1e-10
+
+
 @pytest.mark.parametrize(("kind", "times"), [(SLIP, 0.7), *thorough((LEFT, 0.7), (LEFT, 9.0), (STICKY, 9.0))])
 def test_a_slope_that_moves_carries_a_fluid_that_rests_before_it(kind, times):
     """At the speed of the slope, in any direction, nothing pushes: the drop goes on as it is."""

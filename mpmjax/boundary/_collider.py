@@ -114,7 +114,8 @@ class AbstractCollider(AbstractBoundary):
 
     def sloped(self, place: Float[Array, "m d"], t: Scalar) -> tuple[Float[Array, "m"], Float[Array, "m d"]]:
         """The distance of points in the shape's own frame [m], and the body's unit normal there at time t: infinite and
-        zero where the distance has no slope, as a sampled one may have none."""
+        zero where the distance has no slope, as a sampled one may have none. In the middle of a step that turns a body
+        of revolution about its axis the normal is across the chords on which the surface moves."""
         distance, slope = jax.vjp(self.shape.distance, place)
         (slope,) = slope(jnp.ones_like(distance))
         steepness = length(slope)
@@ -128,7 +129,7 @@ class AbstractCollider(AbstractBoundary):
         """The map of the surface for what flows, by its weights at the nodes; none follow at a half-space across an
         axis."""
         nodes, order = grid.nodes(window), len(faces.stencil.basis.knots) - 1
-        distance, normal = self.sloped(self.moved_by(nodes.dtype).origin(nodes, t), t)
+        distance, normal = self.sloped(self.moved_by(nodes.dtype).origin(nodes, t), t + dt / 2)
         askew = ~jnp.isfinite(jnp.array([position for _, position, _ in self.across_axes(t)])).any()
         velocity = self.wall_velocity(nodes, t, dt)
         return surface_image(distance, normal, (flowing > 0) & askew, grid, window, order, velocity, self.sticks)
@@ -219,7 +220,7 @@ class SlipCollider(AbstractHoldingCollider):
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = v_c·n, but at nodes where the distance has no slope, as a sampled one may have none."""
         nothing, place, velocity = self.seen_by(nodes, t, dt, reference)
-        _, normal = self.sloped(place, t)
+        _, normal = self.sloped(place, t + dt / 2)
         held = self.shape.contains(place, ON_THE_WALL * spacing)[:, None]
         touched = replace(nothing, slides=(Slide(jnp.where(held, normal, 0), jnp.where(held, velocity, 0)),))
         return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)

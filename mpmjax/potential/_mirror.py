@@ -239,15 +239,15 @@ class Mirror(eqx.Module):
             total = jnp.where(image.carried(field.shape[1]), field, total)
         return total
 
-    def with_leaders(self, field: NodeVector) -> NodeVector:
-        """A velocity [m/s] of true nodes with V at those that others follow at a surface that moves: lumped masses are
-        BᵀMB only of what moves along a surface, so that velocities are folded relative to it."""
+    def with_leaders(self, field: NodeVector, v: NodeVector) -> NodeVector:
+        """A velocity [m/s] of true nodes, with v as if it moved with the surface at those that others follow at one that
+        moves: lumped masses are BᵀMB only of what does, so that velocities are folded relative to it."""
         walls = [image for image in self.images if isinstance(image, WallImage | SurfaceImage)]
         true = ~reduce(jnp.logical_or, (image.carried(field.shape[1]) for image in walls), jnp.zeros(field.shape, bool))
         for image in self.moving:
             if isinstance(image, SurfaceImage) and image.velocity is not None:
                 leads = true & image.reached(field.shape)
-                field = jnp.where(leads, self.unscaled(jnp.where(leads, image.velocity, 0)), field)
+                field = jnp.where(leads, self.unscaled(jnp.where(leads, image.following(v), 0)), field)
         return field
 
     def with_motion(self, velocity: NodeVector) -> NodeVector:

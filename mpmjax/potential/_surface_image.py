@@ -23,7 +23,8 @@ class SurfaceImage(eqx.Module):
     height: NodeScalar  # ξ, the distance before the surface in spacings, shape (n,)
     normal: NodeVector  # n, out of the surface [-], shape (n, d)
     velocity: NodeVector | None = None
-    """Velocity V of a surface that moves, at the nodes [m/s], shape (n, d); None at rest. v is then relative to it."""
+    """Velocity V of a surface that moves, at the nodes [m/s], shape (n, d); None at rest. v is then relative to it,
+    along normals alone unless it sticks."""
     sticks: bool = eqx.field(static=True, default=False)  # whether it holds the whole velocity
 
     @property
@@ -117,9 +118,18 @@ class SurfaceImage(eqx.Module):
         return jnp.broadcast_to(self.follows[:, None], (len(self.height), dim))
 
     def with_motion(self, field: NodeVector) -> NodeVector:
-        """A velocity [m/s] with (1 − B) V where nodes follow."""
+        """A velocity [m/s] with (1 − B) V where nodes follow, of its normal part alone unless the surface sticks."""
+        V = self.following(jnp.zeros_like(field))
+        added = V - self.vector(V)
+        if not self.sticks:
+            added = (self.normal * added).sum(axis=1, keepdims=True) * self.normal
+        return jnp.where(self.follows[:, None], added, field)
+
+    def following(self, v: NodeVector) -> NodeVector:
+        """A velocity [m/s], shape (n, d), that moves with the surface, along its normal or where it sticks wholly."""
         assert self.velocity is not None
-        return jnp.where(self.follows[:, None], self.velocity - self.vector(self.velocity), field)
+        across = ((self.velocity - v) * self.normal).sum(axis=1, keepdims=True)
+        return self.velocity if self.sticks else v + across * self.normal
 
     def moved(self, unfolded: NodeVector, field: NodeVector) -> NodeVector:
         """As of a `WallImage`."""

@@ -138,7 +138,7 @@ class Nodes(AbstractNodes):
         folded, v, put_back = replace(self, mass=mass), self.v, None
         if images.moving:  # at rest with the mirrors: the velocity less what they add, which is put back
             put_back = images.with_motion(jnp.where(self.conditions.fixed, self.conditions.velocity, 0))
-            put_back = images.with_leaders(images.added(put_back))
+            put_back = images.with_leaders(images.added(put_back), self.v)
             v = v - jnp.where(self.occupied, images.unfold(put_back), 0)
             put_back = jnp.where(folded.occupied, put_back, 0)
             folded = replace(folded, conditions=replace(self.conditions, moves=True))
