@@ -240,7 +240,7 @@ class Mirror(eqx.Module):
         return total
 
     def with_leaders(self, field: NodeVector, v: NodeVector) -> NodeVector:
-        """A velocity [m/s] of true nodes, with v as if it moved with the surface at those that others follow at one that
+        """A velocity [m/s] of true nodes, with v as if it moved along at those that others follow at a surface that
         moves: lumped masses are BᵀMB only of what does, so that velocities are folded relative to it."""
         walls = [image for image in self.images if isinstance(image, WallImage | SurfaceImage)]
         true = ~reduce(jnp.logical_or, (image.carried(field.shape[1]) for image in walls), jnp.zeros(field.shape, bool))
