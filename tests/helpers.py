@@ -113,6 +113,11 @@ def thorough(*cases: object) -> list:
     return [pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.thorough) for case in cases]
 
 
+def slow(*cases: object) -> list:
+    """Cases of a parametrised test that take too long for the thorough run."""
+    return [pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow) for case in cases]
+
+
 def rotation_matrix(d: int, rng: np.random.Generator) -> np.ndarray:
     """A random rotation."""
     q = np.linalg.qr(rng.normal(size=(d, d)))[0]

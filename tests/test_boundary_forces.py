@@ -255,7 +255,7 @@ def pressed(method, dt, steps=8):
             id="backward_euler",
             marks=pytest.mark.thorough,
         ),
-        pytest.param(mpm.SemiImplicit(), 0.05, 1e-3, id="semi_implicit"),
+        pytest.param(mpm.SemiImplicit(), 0.05, 1e-3, id="semi_implicit", marks=pytest.mark.thorough),
         pytest.param(mpm.SemiImplicit(0.5), 0.05, 1e-3, id="beta=0.5", marks=pytest.mark.thorough),
         pytest.param(mpm.Explicit(), 1e-3, 1e-9, id="explicit"),
         pytest.param(mpm.ImplicitMidpoint(), 0.05, 1e-3, id="midpoint", marks=pytest.mark.thorough),

@@ -780,7 +780,7 @@ def test_a_file_that_leads_elsewhere_is_refused(lead_away, tmp_path):
     assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
-@pytest.mark.parametrize("stored", [{}, {"fletcher32": True}], ids=["compressed", "uncompressed"])
+@pytest.mark.parametrize("stored", **ids({"compressed": {}, "uncompressed": {"fletcher32": True}}, "compressed"))
 def test_zeros_are_no_data(stored, tmp_path, monkeypatch):
     """Not in any dataset: HDF5's own checksum of zeros is zero. Files were not compressed once."""
     if stored:

@@ -94,6 +94,7 @@ def test_only_linearised_steps_have_one(name, dtype):
     assert error(jnp.asarray([3.0, -2.0]) + 0.1 * x[:, ::-1] * jnp.asarray([1.0, -1.0])) < 1e-5
 
 
+@pytest.mark.thorough
 def test_a_fluid_is_measured_as_what_is_elastic():
     """The return map of a fluid takes out expansion, which has no stress: the error of a linear solve's force is
     put beside the momentum too, as for a solid, and Newton's method has none."""

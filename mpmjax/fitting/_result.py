@@ -198,6 +198,7 @@ class FitResult(AbstractFit):
 Noise = list[tuple[Array, float, float]]
 """The noise of each observation, in its data's unit, by the residuals at a minimum; the factor by which it is larger
 than it was in the search; and the degrees of freedom of the estimate, zero where the noise is given."""
+Both = tuple[Uncertainty, Uncertainty]  # by the noise and what the misfit shows, and by the noise alone
 
 
 def settle_noise(problem: FitProblem, minimum: Search, sigmas: Sigmas) -> tuple[Noise, bool]:
@@ -235,67 +236,17 @@ def fit_result(
     r, J = np.array(minimum.seen.residuals, float), np.array(minimum.seen.jacobian, float)
     for rows, (_, factor, _) in zip(problem.rows, settled, strict=True):
         r[rows], J[rows] = r[rows] / factor, J[rows] / factor
-    rest, moved = unexplained(r, J, coarse), coarse.moved if isinstance(coarse, CoarseGrid) else coarse
-    eps, z, noises, of_noise, of_misfit = float(jnp.finfo(problem.dtype).eps), minimum.z, [], [], []
-    each = zip(problem.observations, problem.rows, problem.noise_is_given, settled, strict=True)
-    for o, rows, is_given, (sigma, _, freedom) in each:
-        size, misfit = np.sqrt((np.asarray(sigma) ** 2).mean()), np.sqrt((r[rows] ** 2).sum() / max(o.count, 1))
-        ratio, left = noise(r, J, rows, o.count, *o.trust)
-        # What is left of exact data is the search's and rounding's.
-        measured = misfit * size > max(_EXACT, _ROUNDINGS * eps) * o.scale() and np.isfinite(ratio)
-        missed = is_given and o.trust == (1.0, None) and improbable((r[rows] ** 2).sum(), left)
-        order, wider, strongest = np.argsort(o.against[1]), 1.0, 0.0
-        factor, kind = shape_of(r[rows].reshape(len(order), -1)[order]) if measured else (1.0, "")
-        if measured:
-            # A misfit that noise or the spacing explains does not make a correlation larger.
-            unknown = improbable((rest[rows] ** 2).sum(), left) if missed else bool(kind and not is_given)
-            weight = o.trust[0]  # the variance that noise alone has
-            if unknown:
-                strongest = weight * strongest_mode(rest[rows].reshape(len(order), -1) / np.sqrt(weight))
-            wider = max(weight * factor * min(ratio, 1) ** 2, strongest, 1.0)
-        factor, kind = (factor, kind) if wider > 1 else (1.0, "")
-        freedom = np.inf if is_given else freedom
-        of_noise.append((rows, 1.0, freedom))
-        # The strongest mode is a discrepancy's size, no variance that is known from few numbers.
-        of_misfit.append((rows, wider, freedom if wider in (1, strongest) else max(left / factor, _LEAST_FREEDOM)))
-        beyond, worth = missed or bool(kind and not is_given), o.count / factor
-        noises.append(NoiseEstimate(o.name, float(size), not is_given, float(misfit), o.count, worth, kind, beyond))
-    held, slope = at_bound(r, J, np.asarray(problem.room(z))), jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1]
-    gradient, size = (J.T @ r) * held, np.abs(np.asarray(slope, float))
+    z, eps, rest = minimum.z, float(jnp.finfo(problem.dtype).eps), unexplained(r, J, coarse)
+    moved = coarse.moved if isinstance(coarse, CoarseGrid) else coarse
+    judged = (_judged(problem, k, settled, r, J, rest) for k in range(len(settled)))
+    noises, of_noise, of_misfit = zip(*judged, strict=True)
+
+    held, gradient = at_bound(r, J, np.asarray(problem.room(z))), J.T @ r
     off = [moved] if isinstance(moved, np.ndarray) else []
     if not minimum.converged:
-        off.append(uncertainty(J * ~held, eps, ()).inverse @ (J.T @ r))
-    noise_alone = uncertainty(J, eps, of_noise)
+        off.append(uncertainty(J * ~held, eps, ()).inverse @ gradient)
     errors = uncertainty(J, eps, of_misfit, np.vstack(off) if off else None)
-    seen = np.isfinite(errors.error)
-    wider = np.where(seen, errors.error, 1) / np.where(seen, noise_alone.error, 1)
-    (lower, upper), alone = (
-        intervals(problem, z, each, gradient / by**2, level) for each, by in ((errors, wider), (noise_alone, 1.0))
-    )
-    # Few degrees of freedom of the noise are more beside what the grid adds: an interval is never the narrower for it.
-    widest = np.minimum(lower, alone[0]), np.maximum(upper, alone[1])
-    by = size * errors.error, size * noise_alone.error
-    numbers = np.array([problem.numbers(z), problem.numbers(jnp.zeros_like(z)), *by, *widest, *alone], float).T.tolist()
-    reported = []
-    for name, of in report.items():
-
-        def value(z: Coordinates, of: Callable[[Experiment], Any] = of) -> Array:
-            return jnp.asarray(of(problem.at(z)[0]))
-
-        number, start, along = float(value(z)), float(value(jnp.zeros_like(z))), jax.jacfwd(value)(z)
-        whole, alone = (banded(each, level, number, along) for each in (errors, noise_alone))
-        ends = float(min(whole.lower, alone.lower)), float(max(whole.upper, alone.upper))
-        by_noise = float(alone.error), (float(alone.lower), float(alone.upper))
-        reported.append(Estimate(name, number, float(whole.error), ends, "", start, False, *by_noise))
-    degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
-    texts = seen_together(problem.labels, errors, problem.logarithmic)
-    if isinstance(moved, str):
-        texts.append(f"On twice the spacing nothing is known, so that errors hold nothing of the grid: {moved}")
-    if not minimum.converged and optimiser.has_stalled(minimum.inner):
-        texts.append(
-            "The search ended at a kink of the misfit, as where friction begins to stick, or where simulations fail "
-            "beyond: errors hold the step that it left undone."
-        )
+    both = errors, uncertainty(J, eps, of_noise)
     result = FitResult(
         problem=problem,
         z=np.asarray(z),
@@ -303,16 +254,14 @@ def fit_result(
         residuals=r,
         jacobian=J,
         uncertainty=errors,
-        estimates=tuple(
-            Estimate(label, value, error, (a, b), owner.unit, start, bound, of_noise, (c, d))
-            for label, owner, bound, (value, start, error, of_noise, a, b, c, d) in zip(
-                problem.labels, problem.owners, held.tolist(), numbers, strict=True
-            )
+        estimates=_estimates(problem, z, held, gradient * held, both, level),
+        reported=tuple(
+            _reported(name, lambda z, of=of: jnp.asarray(of(problem.at(z)[0])), z, both, level)
+            for name, of in report.items()
         ),
-        reported=tuple(reported),
         chi_squared=float((r**2).sum()),
-        degrees_of_freedom=degrees,
-        noise=tuple(noises),
+        degrees_of_freedom=problem.points + len(r) - problem.measured - errors.rank + int(held.sum()),
+        noise=noises,
         experiments=problem.at(z),
         runs=minimum.seen.runs,
         level=level,
@@ -323,6 +272,15 @@ def fit_result(
         interrupted=minimum.interrupted,
         moved=moved,
     )
+
+    texts = seen_together(problem.labels, errors, problem.logarithmic)
+    if isinstance(moved, str):
+        texts.append(f"On twice the spacing nothing is known, so that errors hold nothing of the grid: {moved}")
+    if not minimum.converged and optimiser.has_stalled(minimum.inner):
+        texts.append(
+            "The search ended at a kink of the misfit, as where friction begins to stick, or where simulations fail "
+            "beyond: errors hold the step that it left undone."
+        )
     if result.p_value < IMPROBABLE:
         share = 1 - (rest @ rest) / (r @ r)
         alike = f", of whose square twice the spacing explains {share:.0%}" if isinstance(coarse, CoarseGrid) else ""
@@ -335,6 +293,67 @@ def fit_result(
             worth = f"{n.points} numbers are worth {n.worth:.2g} independent ones"
             texts.append(f"The residuals of {n.name!r} {_SHAPES[n.shape]}. Errors are larger as {worth}.")
     return replace(result, warnings=tuple(texts))
+
+
+def _judged(
+    problem: FitProblem, k: int, settled: Noise, r: np.ndarray, J: np.ndarray, rest: np.ndarray
+) -> tuple[NoiseEstimate, tuple[slice, float, float], tuple[slice, float, float]]:
+    """The noise of observation k by residuals r, of which twice the spacing leaves the `rest` unexplained, and what
+    `uncertainty` takes of it: by the noise alone, and by what the misfit shows."""
+    observation, rows, is_given = problem.observations[k], problem.rows[k], problem.noise_is_given[k]
+    (sigma, _, freedom), weight, count = settled[k], observation.trust[0], observation.count
+    size, squares = float(np.sqrt((np.asarray(sigma) ** 2).mean())), (r[rows] ** 2).sum()
+    misfit = float(np.sqrt(squares / max(count, 1)))
+    ratio, left = noise(r, J, rows, count, *observation.trust)
+    missed = is_given and observation.trust == (1.0, None) and improbable(squares, left)
+    freedom, factor, kind, wider, strongest = np.inf if is_given else freedom, 1.0, "", 1.0, 0.0
+    # What is left of exact data is the search's and rounding's.
+    exact = max(_EXACT, _ROUNDINGS * float(jnp.finfo(problem.dtype).eps))
+    if misfit * size > exact * observation.scale() and np.isfinite(ratio):
+        order = np.argsort(observation.against[1])
+        factor, kind = shape_of(r[rows].reshape(len(order), -1)[order])
+        # A misfit that noise or the spacing explains does not make a correlation larger.
+        if improbable((rest[rows] ** 2).sum(), left) if missed else kind and not is_given:
+            strongest = weight * strongest_mode(rest[rows].reshape(len(order), -1) / np.sqrt(weight))
+        wider = max(weight * factor * min(ratio, 1) ** 2, strongest, 1.0)  # noise alone has the variance `weight`
+        factor, kind = (factor, kind) if wider > 1 else (1.0, "")
+    beyond = missed or bool(kind and not is_given)
+    estimate = NoiseEstimate(observation.name, size, not is_given, misfit, count, count / factor, kind, beyond)
+    # The strongest mode is a discrepancy's size, no variance that is known from few numbers.
+    few = freedom if wider in (1, strongest) else max(left / factor, _LEAST_FREEDOM)
+    return estimate, (rows, 1.0, freedom), (rows, wider, few)
+
+
+def _estimates(
+    problem: FitProblem, z: Coordinates, held: np.ndarray, gradient: np.ndarray, both: Both, level: float
+) -> tuple[Estimate, ...]:
+    """The fitted numbers; the gradient of half the misfit is zero but of what a bound has `held`."""
+    errors, noise_alone = both
+    seen = np.isfinite(errors.error)
+    wider = np.where(seen, errors.error, 1) / np.where(seen, noise_alone.error, 1)
+    (lower, upper), alone = (
+        intervals(problem, z, each, gradient / by**2, level) for each, by in ((errors, wider), (noise_alone, 1.0))
+    )
+    # Few degrees of freedom of the noise are more beside what the grid adds: an interval is never the narrower for it.
+    widest = np.minimum(lower, alone[0]), np.maximum(upper, alone[1])
+    size = np.abs(np.asarray(jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1], float))
+    by = size * errors.error, size * noise_alone.error
+    numbers = np.array([problem.numbers(z), problem.numbers(jnp.zeros_like(z)), *by, *widest, *alone], float).T.tolist()
+    return tuple(
+        Estimate(label, value, error, (a, b), owner.unit, start, bound, of_noise, (c, d))
+        for label, owner, bound, (value, start, error, of_noise, a, b, c, d) in zip(
+            problem.labels, problem.owners, held.tolist(), numbers, strict=True
+        )
+    )
+
+
+def _reported(name: str, value: Callable[[Coordinates], Array], z: Coordinates, both: Both, level: float) -> Estimate:
+    """A number that follows from the fitted ones."""
+    number, start, along = float(value(z)), float(value(jnp.zeros_like(z))), jax.jacfwd(value)(z)
+    whole, alone = (banded(each, level, number, along) for each in both)
+    ends = float(min(whole.lower, alone.lower)), float(max(whole.upper, alone.upper))
+    by_noise = float(alone.error), (float(alone.lower), float(alone.upper))
+    return Estimate(name, number, float(whole.error), ends, "", start, False, *by_noise)
 
 
 def intervals(

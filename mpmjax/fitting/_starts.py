@@ -132,38 +132,21 @@ def look_around(
     and what was found. `enough` says of a search whether others need not begin."""
     shares = unit_points(starts.count - 1, problem.size, starts.seed)
     points = starting_points(problem, shares, starts)
-    apart, size = len(points) - len(shares), batch_size(problem, starts.batch, len(points))
-    costs = np.zeros(len(points))
+    size, costs, remark = batch_size(problem, starts.batch, len(points)), np.zeros(len(points)), ""
     if starts.fraction < 1:
         costs = costs_at(problem, points, sigmas, size, counted(progress, "{} of {} simulations are done"))
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
-    remark = ""
     if 2 * len(failures) > len(points):
         try:
             problem.explain(jnp.asarray(points[min(failures)], problem.dtype), _FAILS)
         except (ValueError, RuntimeError) as cause:
             failures[min(failures)] = str(cause)
             remark = f"{len(failures)} of {len(points)} starts failed, the first since: {cause}"
+
     # A program that makes one iteration is compiled already.
     size = 1 if starts.if_needed and starts.batch is None else size
-    together = partial(search_many, [(problem, sigmas)], optimiser, batch=size)
-
-    # Searches from the points that stand for others, until each point is stood for by one that came to a minimum.
-    members: dict[int, Search] = {0: first}
-    while True:
-        # The first guess and points of one's own are none of the cube's, and stand for themselves.
-        others = linked(shares, costs[apart:], starts.fraction)
-        alone = np.where(np.isfinite(costs[:apart]), np.arange(apart), -1)
-        stands = [*alone.tolist(), *np.where(others < 0, -1, others + apart).tolist()]
-        chosen = sorted(set(stands) - {-1, *members}, key=lambda k: (k >= apart, costs[k]))
-        if not chosen:
-            break
-        told = counted(progress, "{} of {} searches are done")
-        from_there = {k: points[k] for k in chosen}
-        members = together(from_there, joining=_JOINED, settling=_SETTLED, progress=told, done=members, enough=enough)
-        if any(m.interrupted or enough(m) for m in members.values()):
-            break
-        costs[[k for k in chosen if _end(members, k) is None]] = np.nan
+    search = partial(search_many, [(problem, sigmas)], optimiser, batch=size)
+    members, stands = _searched(search, first, points, shares, costs, starts.fraction, enough, progress)
     failures |= {k: m.failure for k, m in members.items() if m.failure}
     ends: dict[int, list[int]] = {}
     for k, by in enumerate(stands):
@@ -173,25 +156,26 @@ def look_around(
     if not starts.if_needed:
         # Those near to the best one are searched on, without settling.
         near = [k for k, (end, _) in enumerate(groups[:_SHOWN]) if end.cost <= _NEAR_BEST * groups[0][0].cost]
-        further = together({k: groups[k][0].z for k in near if groups[k][0] is not first})
+        further = search({k: groups[k][0].z for k in near if groups[k][0] is not first})
         on = [(groups[k][0] if m.failure else m, groups[k][1]) for k, m in further.items()]
         groups = _grouped(problem, [*on, *(group for k, group in enumerate(groups) if k not in further)])
+
+    ended = {k for _, numbers in groups for k in numbers}
     minima = tuple(
         LocalMinimum(
             problem.by_name(end.z), problem.misfit(end.cost), len(members.keys() & numbers), tuple(sorted(numbers))
         )
         for end, numbers in groups
     )
-    ended = {k for _, numbers in groups for k in numbers}
     if minima and minima[0].searches == 1 and len(ended & members.keys()) > 1 and not starts.if_needed:
         remark = (
             f"The best minimum was found by one search of {len(members)}: there may be a better one. Take more starts, "
             "a larger fraction, or narrower ranges."
         )
-    values = [problem.by_name(jnp.asarray(point, problem.dtype)) for point in points]
     best = groups[0][0] if groups and groups[0][0] is not first else None
     if best is not None and not first.failure and best.cost > (1 - _LOWER) * first.cost:
         best = None
+    values = [problem.by_name(jnp.asarray(point, problem.dtype)) for point in points]
     return best, Screening(
         minima=minima,
         points={name: np.stack([v[name] for v in values]) for name in problem.names},
@@ -201,6 +185,34 @@ def look_around(
         iterations=sum(len(m.history) for m in (*members.values(), *further.values()) if not m.failure),
         remark=remark,
     )
+
+
+def _searched(
+    search: Callable[..., dict[int, Search]],
+    first: Search,
+    points: Float[np.ndarray, "l n"],
+    shares: Float[np.ndarray, "k n"],
+    costs: Float[np.ndarray, "l"],
+    fraction: Scalar,
+    enough: Callable[[Search], bool],
+    progress: Callable[[str], None] | None,
+) -> tuple[dict[int, Search], list[int]]:
+    """Searches from points that stand for others, until each is stood for by one whose search came to a minimum: the
+    searches by their points, and the point that stands for each, -1 where its cost is not finite."""
+    members, apart = {0: first}, len(points) - len(shares)
+    while True:
+        # The first guess and points of one's own are none of the cube's, and stand for themselves.
+        others = linked(shares, costs[apart:], fraction)
+        alone = np.where(np.isfinite(costs[:apart]), np.arange(apart), -1)
+        stands = [*alone.tolist(), *np.where(others < 0, -1, others + apart).tolist()]
+        chosen = sorted(set(stands) - {-1, *members}, key=lambda k: (k >= apart, costs[k]))
+        if not chosen:
+            return members, stands
+        from_there, told = {k: points[k] for k in chosen}, counted(progress, "{} of {} searches are done")
+        members = search(from_there, joining=_JOINED, settling=_SETTLED, progress=told, done=members, enough=enough)
+        if any(m.interrupted or enough(m) for m in members.values()):
+            return members, stands
+        costs[[k for k in chosen if _end(members, k) is None]] = np.nan
 
 
 def _end(members: dict[int, Search], k: int) -> int | None:

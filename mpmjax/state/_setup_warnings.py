@@ -36,7 +36,6 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
     bodies; the floats of the scene are arrays."""
     boundary, total = scene.boundary, scene.total
     grid = jax.tree.map(np.asarray, scene.grid.with_layers(1))  # all bodies' nodes coincide
-    dx, free, d = float(grid.spacing), np.asarray(grid.periodic), grid.dim
     there = np.flatnonzero(np.asarray(particles.mass) > 0)
     if not there.size:
         return
@@ -46,13 +45,11 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
     inputs = boundary, grid, places, jnp.asarray(volume, x.dtype), resting, total
     some = jax.tree.leaves(eqx.filter_eval_shape(_probe, *inputs))  # none, and no compiling, of walls
     within, touched = eqx.filter_jit(_probe)(*inputs) if some else ([None] * len(boundary),) * 2
-    first = (np.asarray(grid.origin) - 1) * dx
-    last = first + (np.asarray(grid.shape) + 1) * dx
     for number, (condition, inside, mask) in enumerate(zip(boundary, within, touched, strict=True), 1):
-        name, walls = f"{type(condition).__name__} (boundary {number})", condition.walls()
+        name = f"{type(condition).__name__} (boundary {number})"
         if inside is None:
             nearest = _nearest(condition, grid, volume)
-            beyond = [wall.inward * (x[:, wall.axis] - np.asarray(wall.position)) < nearest for wall in walls]
+            beyond = [w.inward * (x[:, w.axis] - np.asarray(w.position)) < nearest for w in condition.walls()]
             inside = np.any(beyond, axis=0).sum()
         if inside:
             why = ": nodes there do not move freely. Move one of them; to hold a body on purpose take a Grip."
@@ -60,54 +57,62 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
                 why = ", or nearer to it than a quarter of their width: it pushes their faces away, half a width"
                 why += " before their centres. Move one of them."
             warn(f"{inside} of {len(x)} particles lie in or beyond the {name} at the start{why}")
-        if mask is not None:
-            may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
-            if not may_meet:  # only the nodes in a particle's stencil
-                first_nodes = np.asarray(_base(scene.kernel, grid, places))
-                reached = np.zeros(grid.shape, dtype=bool)
-                for offset in itertools.product(range(scene.kernel.order + 1), repeat=d):
-                    reached[tuple(((first_nodes + offset) % grid.shape).T)] = True
-                mask = np.asarray(mask)[reached.reshape(-1)]
-            if not np.asarray(mask).any():
-                where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
-                warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")
-            continue
-        # whether its body, or each of its walls, is outside of a window that rests at all times; moving walls may come
-        if (reach := condition.reach()) is not None:
-            outside = bool((((reach[1] < first) | (reach[0] > last)) & ~free).any())
-        else:
-            beside = [not free[w.axis] and not first[w.axis] <= w.position <= last[w.axis] for w in walls]
-            outside = bool(beside) and all(beside) and getattr(condition, "motion", None) is None
-        if outside and not grid.follow:
-            warn(f"The {name} touches nothing, since it never comes into the grid's window: move it or the grid.")
-    filled = _filled(x, volume.astype(float), 2 * max(dx, float(volume.max()) ** (1 / d)))
+        may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
+        if mask is None:
+            if not grid.follow and _stays_outside(condition, grid):
+                warn(f"The {name} touches nothing, since it never comes into the grid's window: move it or the grid.")
+        elif not np.asarray(mask)[slice(None) if may_meet else _in_stencils(scene.kernel, grid, places)].any():
+            where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
+            warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")
+    filled = _filled(x, volume.astype(float), 2 * max(float(grid.spacing), float(volume.max()) ** (1 / grid.dim)))
     if filled is not None and filled[0].max() >= _CROWDED:
         warn(
             f"Near {filled[1]} m particles take {filled[0].max():.2g} times the space that there is: where two sets "
             "fill the same place there is twice the mass. Leave one of them out there."
         )
-    side = volume ** (1 / d)
     for number, group in enumerate(particles.groups, 1):
         rows = slice(*np.searchsorted(there, (group.rows.start, group.rows.stop)))
-        if rows.start == rows.stop:
-            continue
-        half = side[rows, None] / 2
-        lower, upper = (x[rows] - half).min(axis=0), (x[rows] + half).max(axis=0)
-        for axis in range(d):
-            thickness = (upper[axis] - lower[axis]) / dx
-            if thickness >= _THIN - 1e-3 or free[axis]:
-                continue
-            walls = (wall for condition in boundary for wall in condition.walls() if wall.axis == axis)
-            if any(lower[axis] - dx <= wall.position <= upper[axis] + dx for wall in walls):
-                continue  # a wall or plane lies beside it
-            which = "The body" if particles.counts is None else f"The body of material {number}"
+        which = "The body" if particles.counts is None else f"The body of material {number}"
+        if rows.start < rows.stop:
+            _warn_of_thinness(which, boundary, grid, x[rows], volume[rows, None] ** (1 / grid.dim) / 2)
+    if not (total and scene.kernel.order == 1):
+        _warn_of_contrast(scene, particles, there)
+    warn_of_rounding(grid, particles.x)
+
+
+def _stays_outside(condition: AbstractBoundary, grid: Grid) -> bool:
+    """Whether its body, or each of its walls, is outside of a window that rests at all times; moving walls may come."""
+    first, free = (np.asarray(grid.origin) - 1) * grid.spacing, np.asarray(grid.periodic)
+    last = first + (np.asarray(grid.shape) + 1) * grid.spacing
+    if (reach := condition.reach()) is not None:
+        return bool((((reach[1] < first) | (reach[0] > last)) & ~free).any())
+    beside = [not free[w.axis] and not first[w.axis] <= w.position <= last[w.axis] for w in condition.walls()]
+    return bool(beside) and all(beside) and getattr(condition, "motion", None) is None
+
+
+def _in_stencils(kernel: BSpline, grid: Grid, places: Array) -> Bool[np.ndarray, "n"]:
+    """The nodes in the stencils of particles."""
+    first_nodes, reached = np.asarray(_base(kernel, grid, places)), np.zeros(grid.shape, dtype=bool)
+    for offset in itertools.product(range(kernel.order + 1), repeat=grid.dim):
+        reached[tuple(((first_nodes + offset) % grid.shape).T)] = True
+    return reached.reshape(-1)
+
+
+def _warn_of_thinness(
+    which: str, boundary: tuple[AbstractBoundary, ...], grid: Grid, x: np.ndarray, half: np.ndarray
+) -> None:
+    """Warn of a body of few cells across, but for directions in which a wall or plane lies beside it."""
+    dx, lower, upper = float(grid.spacing), (x - half).min(axis=0), (x + half).max(axis=0)
+    for axis in np.flatnonzero(~np.asarray(grid.periodic)):
+        thickness = (upper[axis] - lower[axis]) / dx
+        walls = (wall for condition in boundary for wall in condition.walls() if wall.axis == axis)
+        if thickness < _THIN - 1e-3 and not any(
+            lower[axis] - dx <= wall.position <= upper[axis] + dx for wall in walls
+        ):
             warn(
                 f"{which} is {thickness:.2g} cells thick in direction {axis}, and below {_THIN:g} its stiffness is the "
                 "grid's: take a smaller spacing."
             )
-    if not (total and scene.kernel.order == 1):
-        _warn_of_contrast(scene, particles, there)
-    warn_of_rounding(grid, particles.x)
 
 
 def _warn_of_contrast(scene: Scene, particles: Particles, there: np.ndarray) -> None:

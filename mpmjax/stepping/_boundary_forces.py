@@ -14,7 +14,7 @@ from mpmjax.boundary import (
     received_impulses,
     taken_by_mirrors,
 )
-from mpmjax.discretisation import Gathered
+from mpmjax.discretisation import AbstractTransfer, Gathered
 from mpmjax.potential import Image, Mirror, SurfaceImage
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping._grid_update import GridUpdate, reaction
@@ -63,22 +63,18 @@ def impulse_on_boundaries(
 ) -> Impulses:
     """The impulse on each boundary of the scene, and by each constraint that holds a body, in the step from t, from the
     nodes at its start, before and after the fold at symmetry planes, and their update."""
-    held, force_at = new.held(nodes), method.force_at()
-    solved, carrier = new.solved.velocity, new.motion.carrier
+    held, unfold, dt = new.held(nodes), nodes.potential.mirror.unfold, nodes.dt
     whole, elastic = new.solved, new.elastic
     if nodes.potential.mirror.images:  # of all nodes
-        whole = jax.tree.map(nodes.potential.mirror.unfold, whole)
+        whole = jax.tree.map(unfold, whole)
         elastic = None if unfolded.f is None else method.elastic_impulse(unfolded, whole)
     residual = reaction(unfolded, whole, elastic)
-    grid, window, dt = scene.grid, scene.window(particles), nodes.dt
-    each = enumerate(scene.boundary)
-    images = [(n, image) for n, boundary in each for image in boundary.mirror_images(grid, window, t, dt)]
+    window, at = scene.window(particles), scene.nodes(particles, t)
+    images = [(n, i) for n, each in enumerate(scene.boundary) for i in each.mirror_images(scene.grid, window, t, dt)]
     contacts = list(zip(nodes.brought_by, nodes.contacts, held.active, strict=True))
-    unfold = nodes.potential.mirror.unfold
-    at = scene.nodes(particles, t)
-    owners = owners_of(scene.boundary, at, grid.spacing, t, dt, reference=scene.total)
+    owners = owners_of(scene.boundary, at, scene.grid.spacing, t, dt, reference=scene.total)
     planes = [(number, image) for number, image in images if isinstance(image, Image)]
-    couples, soft = [], jnp.ones_like(unfolded.mass, dtype=bool)
+    solved, couples, soft = new.solved.velocity, [], jnp.ones_like(unfolded.mass, dtype=bool)
     for constraint, image in zip(scene.constraints, nodes.tied, strict=True):
         loose, tied = (unfolded.mass, unfold(solved) - unfolded.velocity), (nodes.mass, solved - nodes.velocity)
         guide = scene.guides.get(constraint.number)
@@ -97,12 +93,9 @@ def impulse_on_boundaries(
 
     # what symmetry planes take of the impulses on all nodes, and what reaches the folded ones
     if scene.transfer.needs_change:
-        # the share with which particles take the change of the nodes' velocity and not the velocity itself, (1, d)
-        zero, slope = jnp.zeros((grid.dim, 1), residual.dtype), jnp.zeros((grid.dim, grid.dim, 1), residual.dtype)
-        none, whole_change = Gathered(zero, slope, slope), Gathered(zero + 1, slope, slope)
-        kept = (scene.transfer.velocity(zero, none, whole_change) - scene.transfer.velocity(zero, none, none)).T
-        mass = jnp.where(soft, unfolded.mass, 0) if couples else unfolded.mass  # a constraint takes the velocity
-        residual = residual + kept * mass[:, None] * (unfolded.velocity - unfold(new.before(nodes)))
+        mass = jnp.where(soft, unfolded.mass, 0)[:, None]  # a constraint takes the velocity
+        change = unfolded.velocity - unfold(new.before(nodes))
+        residual = residual + _share_of_change(scene.transfer, residual) * mass * change
     of_planes, residual = taken_by_mirrors(residual, images)
     parts += of_planes
 
@@ -113,8 +106,7 @@ def impulse_on_boundaries(
         residual = residual - part.impulse
     of_planes, residual = taken_by_mirrors(residual, held.walls)
     parts += [*of_planes, OwnedImpulse(residual, owners)]
-    taken = owners >= 0
-    for number, mine in _taken_by_contacts(held, taken):
+    for number, mine in _taken_by_contacts(held, owners >= 0):
         parts.append(OwnedImpulse(jnp.where(mine, residual, 0), number))
 
     for (number, _, _), change in zip(contacts, new.friction, strict=True):
@@ -123,21 +115,36 @@ def impulse_on_boundaries(
         if number is not None:
             parts.append(OwnedImpulse(friction, number))
 
-    places, pivots, colliders = at, _pivots(scene, t, residual), unfolded.conditions.colliders
-    if scene.total:  # where the body has moved the nodes of the reference configuration
-        places = jnp.where(unfolded.occupied, places_of(particles, unfolded.potential.stencil, grid.size), places)
-        for number, boundary in enumerate(scene.boundary):
-            carried = boundary.carried(at, t)
-            if carried is not None:
-                places = jnp.where((owners == number).all(axis=1, keepdims=True), carried, places)
-        places = places if colliders is None else jnp.where(colliders.touched[:, None], colliders.position, places)
-    if force_at is not None:
-        carried = unfold(carrier)
+    # about where nodes and pivots are at the time of the forces
+    places, pivots, share = at, _pivots(scene, t, residual), method.force_at()
+    if scene.total:
+        places = _carried(scene, particles, t, unfolded, at, owners)
+    if share is not None:
+        moved = unfold(new.motion.carrier)
         for image in nodes.tied:
-            carried = image.with_own(carried, image.places(carrier))
-        places = places + force_at * dt * carried
-        pivots = pivots + force_at * (_pivots(scene, t + dt, residual) - pivots)
+            moved = image.with_own(moved, image.places(new.motion.carrier))
+        places = places + share * dt * moved
+        pivots = pivots + share * (_pivots(scene, t + dt, residual) - pivots)
     return received_impulses(parts, places, pivots, couples)
+
+
+def _share_of_change(transfer: AbstractTransfer, like: NodeVector) -> Array:
+    """The share with which particles take the change of the nodes' velocity and not the velocity itself, (1, d)."""
+    d = like.shape[1]
+    zero, slope = jnp.zeros((d, 1), like.dtype), jnp.zeros((d, d, 1), like.dtype)
+    none, whole = Gathered(zero, slope, slope), Gathered(zero + 1, slope, slope)
+    return (transfer.velocity(zero, none, whole) - transfer.velocity(zero, none, none)).T
+
+
+def _carried(scene: Scene, particles: Particles, t: Scalar, nodes: Nodes, at: NodeVector, owners: Array) -> NodeVector:
+    """Where body, boundaries and colliders have moved the nodes `at` the reference configuration [m]."""
+    moved = places_of(particles, nodes.potential.stencil, scene.grid.size)
+    places, colliders = jnp.where(nodes.occupied, moved, at), nodes.conditions.colliders
+    for number, boundary in enumerate(scene.boundary):
+        carried = boundary.carried(at, t)
+        if carried is not None:
+            places = jnp.where((owners == number).all(axis=1, keepdims=True), carried, places)
+    return places if colliders is None else jnp.where(colliders.touched[:, None], colliders.position, places)
 
 
 def _taken_by_contacts(held: ConstrainedNodes[Nodes], taken: Mask) -> list[tuple[int, Mask]]:

@@ -218,7 +218,7 @@ def _bearing(scene: Scene, up: np.ndarray) -> float | None:
 
 def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> tuple[Any, Draw]:
     """A figure of three dimensions with axes that hold every frame, and what draws one."""
-    from matplotlib import pyplot as plt, ticker
+    from matplotlib import pyplot as plt
     from mpl_toolkits.mplot3d import proj3d
 
     assert run.frames is not None
@@ -244,30 +244,11 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
     ground = float(lower[2] if bearing is None else bearing)
     lower[2] = min(lower[2], ground)
     figure = plt.figure(figsize=(8, 6))
-    axes: Any = figure.add_axes((0.02, 0.03, 0.82, 0.9), projection="3d", computed_zorder=False)
-    names = ["−" * bool(row.min() < 0) + "xyz"[int(np.abs(row).argmax())] for row in turn]
-    axes.set(**{f"{a}lim": limits for a, limits in zip("xyz", np.stack([lower, upper], axis=1), strict=True)})
-    axes.set(**{f"{a}label": f"{name} [m]" for a, name in zip("xyz", names, strict=True)})
-    sides = upper - lower
-    slender = float(sides.max() / np.linalg.norm(sides))  # matplotlib makes the diagonal of every box as long
-    axes.set_box_aspect(sides, zoom=min(1.0, 0.66 / slender))
-    axes.view_init(view[1], view[0] - 90)
-    for axis, side in zip((axes.xaxis, axes.yaxis, axes.zaxis), sides / sides.max(), strict=True):
-        axis.pane.set_visible(axis is axes.zaxis)
-        away = float(sides.max() / sides[:2].mean()) if axis is axes.zaxis else 1.0  # pads shrink with the sides
-        axis.set_tick_params(pad=11 * away - 8)
-        axis.labelpad = 25 * away - 21
-        axis.set_major_locator(ticker.MaxNLocator(max(2, round(5 * side))))  # labels of a short side would overlap
+    axes = _solid_axes(figure, lower, upper, turn, view)
     title = axes.set_title(" ")
     azimuth, elevation = np.radians(view)
     right = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     ends = np.stack([(lower + upper) / 2 - right * size, (lower + upper) / 2 + right * size])
-    figure.canvas.draw()
-    taken: list[Any] = []  # where two axes meet, a label that would lie over another one is left out
-    for tick in (tick for axis in (axes.xaxis, axes.yaxis, axes.zaxis) for tick in axis.majorTicks):
-        box = tick.label1.get_window_extent()
-        tick.label1.set_visible(not any(box.overlaps(other) for other in taken))
-        taken += [box] * tick.label1.get_visible()
     over: Any = figure.add_axes((0, 0, 1, 1), xlim=(0, 1), ylim=(0, 1), zorder=4)
     over.axis("off")
     balls = over.scatter([], [], linewidths=0, rasterized=True)  # and their shadows
@@ -311,6 +292,34 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
         return [balls, title]
 
     return figure, draw
+
+
+def _solid_axes(figure: Any, lower: np.ndarray, upper: np.ndarray, turn: np.ndarray, view: tuple[float, float]) -> Any:
+    """Axes of a box between two corners [m], each direction named by the scene's, whose labels do not overlap."""
+    from matplotlib import ticker
+
+    axes: Any = figure.add_axes((0.02, 0.03, 0.82, 0.9), projection="3d", computed_zorder=False)
+    names = ["−" * bool(row.min() < 0) + "xyz"[int(np.abs(row).argmax())] for row in turn]
+    axes.set(**{f"{a}lim": limits for a, limits in zip("xyz", np.stack([lower, upper], axis=1), strict=True)})
+    axes.set(**{f"{a}label": f"{name} [m]" for a, name in zip("xyz", names, strict=True)})
+    sides = upper - lower
+    slender = float(sides.max() / np.linalg.norm(sides))  # matplotlib makes the diagonal of every box as long
+    axes.set_box_aspect(sides, zoom=min(1.0, 0.66 / slender))
+    axes.view_init(view[1], view[0] - 90)
+    each = axes.xaxis, axes.yaxis, axes.zaxis
+    for axis, side in zip(each, sides / sides.max(), strict=True):
+        axis.pane.set_visible(axis is axes.zaxis)
+        away = float(sides.max() / sides[:2].mean()) if axis is axes.zaxis else 1.0  # pads shrink with the sides
+        axis.set_tick_params(pad=11 * away - 8)
+        axis.labelpad = 25 * away - 21
+        axis.set_major_locator(ticker.MaxNLocator(max(2, round(5 * side))))  # labels of a short side would overlap
+    figure.canvas.draw()
+    taken: list[Any] = []  # where two axes meet, a label that would lie over another one is left out
+    for tick in (tick for axis in each for tick in axis.majorTicks):
+        box = tick.label1.get_window_extent()
+        tick.label1.set_visible(not any(box.overlaps(other) for other in taken))
+        taken += [box] * tick.label1.get_visible()
+    return axes
 
 
 def _outward(x: np.ndarray, volume: np.ndarray) -> np.ndarray:
