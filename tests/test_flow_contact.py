@@ -130,6 +130,18 @@ def wall_at(plane, kind, motion=None, friction=0.0):
     return kind(plane, motion, friction) if kind is LEFT else kind(plane, motion)
 
 
+def test_a_map_has_room_for_the_nodes_near_its_surface_or_takes_all():
+    """The sums are the same."""
+    image, nodes, _, _ = slope(2, n=40)
+    small, rng = slope(2)[0], np.random.default_rng(0)
+    assert (bool(image.fits), bool(small.fits)) == (True, False)
+    v, mass = jnp.asarray(rng.normal(size=nodes.shape)), jnp.asarray(rng.random(len(nodes)))
+    masses = mass[:, None, None] * (jnp.eye(2) + 0.1)
+    every = dataclasses.replace(image, fits=jnp.array(False))
+    for name, given in (("vector", (v,)), ("fold", (v,)), ("spread", (v,)), ("fold_masses", (masses, mass))):
+        jax.tree.map(lambda a, b: assert_close(a, b, 1e-12), getattr(image, name)(*given), getattr(every, name)(*given))
+
+
 def shaken(speed, friction=0.0, motion=None, law=mpm.Fluid(1e4), push=(0.0, 0.0), kind=LEFT):
     """A drop of fluid on a slope, at a speed along the slope's normal."""
     normal = np.array([-0.6, 0.8])

@@ -181,8 +181,7 @@ def with_one_mass(
     across = across[:, :, None] * jnp.eye(dim, dtype=mass.dtype)
     for _, surface in reversed(surfaces):
         image = surface.taking(usable)
-        across, mass, usable = image.fold_masses(across), image.fold_scalar(mass), usable & ~image.follows
-        images = (image, *images)
+        (across, mass), usable, images = image.fold_masses(across, mass), usable & ~image.follows, (image, *images)
     return Mirror((Scaling(*one_mass(across, mass, fixed)), *images)), numbers, mass
 
 

@@ -1,6 +1,9 @@
 """Surfaces of any shape that hold a fluid: the map of the nodes about them, linear across the surface."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +12,27 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector
-from mpmjax.discretisation import BSpline, Grid, MLSGradient, make_stencil
+from mpmjax.discretisation import BSpline, Grid, MLSGradient, Stencil, gather, make_stencil, scatter
+
+_NEAR = 8  # the part of all nodes for which there is room about a surface; where it has more, sums are over all
+
+
+class _Rows(eqx.Module):
+    """Nodes about a surface, all or some, in rows."""
+
+    number: Int[Array, "m"]  # theirs, or of none where rows are left over, shape (m,)
+    stencil: Stencil  # of the places whose nodes each follows, with weights w_ik
+    height: Float[Array, "m"]  # ξ, the distance before the surface in spacings, shape (m,)
+    normal: Float[Array, "m d"]  # n, out of the surface [-], shape (m, d)
+
+    def of(self, field: Float[Array, "n *c"]) -> Float[Array, "m *c"]:
+        """A field's values there, zero for no nodes."""
+        return field.at[self.number].get(mode="fill", fill_value=0, wrap_negative_indices=False)
+
+    def laid(self, values: Float[Array, "m c"], like: Float[Array, "n k"]) -> Float[Array, "n c"]:
+        """A field with these values, zero elsewhere."""
+        zeros = jnp.zeros((len(like), values.shape[1]), values.dtype)
+        return zeros.at[self.number].add(values, wrap_negative_indices=False)
 
 
 class SurfaceImage(eqx.Module):
@@ -18,10 +41,14 @@ class SurfaceImage(eqx.Module):
     v_i = (1 − n_i n_iᵀ) Σ τ_ik v_k + n_i Σ τ_ik (ξ_i/ξ_k) n_k·v_k,   where the surface sticks Σ τ_ik (ξ_i/ξ_k) v_k .
     """
 
-    parents: Int[Array, "k n"]  # the numbers of each node's parents, shape (k, n)
-    part: Float[Array, "k n"]  # τ_ik [-], of sum one, or zero for nodes that follow none, shape (k, n)
+    stencil: Stencil  # of the places whose nodes each node follows, with weights w_ik
     height: NodeScalar  # ξ, the distance before the surface in spacings, shape (n,)
     normal: NodeVector  # n, out of the surface [-], shape (n, d)
+    near: _Rows  # the nodes that may follow, as many as there is room for
+    fits: Bool[Array, ""]  # whether there is room for all of them
+    parents: NodeScalar  # p_k, one for nodes that may be followed and else zero, shape (n,)
+    behind: Bool[Array, "n"]  # the nodes that may follow, shape (n,)
+    share: NodeScalar  # 1/Σ w_ik p_k, with τ_ik = w_ik p_k times that, or zero for nodes that follow none, shape (n,)
     velocity: NodeVector | None = None
     """Velocity V of a surface that moves, at the nodes [m/s], shape (n, d); None at rest. v is then relative to it,
     along normals alone unless it sticks."""
@@ -30,26 +57,36 @@ class SurfaceImage(eqx.Module):
     @property
     def follows(self) -> Bool[Array, "n"]:
         """The nodes that follow others, shape (n,)."""
-        return self.part.sum(axis=0) > 0
+        return self.share > 0
 
     def taking(self, usable: Bool[Array, "n"]) -> "SurfaceImage":
         """The map with parents among these alone; a node without any stays free."""
-        part = jnp.where(usable[self.parents], self.part, 0)
-        total = part.sum(axis=0)
+        parents = jnp.where(usable, self.parents, 0)
+        total = replace(self, parents=parents, share=self.behind.astype(parents.dtype)).mean(parents[:, None])[:, 0]
         some = total > 1e-6
-        return replace(self, part=jnp.where(some, part / jnp.where(some, total, 1), 0))
+        return replace(self, parents=parents, share=jnp.where(some, 1 / jnp.where(some, total, 1), 0))
 
     def where(self, active: Bool[Array, "n"]) -> "SurfaceImage":
         """The map of nodes most of whose parents are held."""
-        return replace(self, part=jnp.where(self.mean(active.astype(self.part.dtype)[:, None]) > 0.5, self.part.T, 0).T)
+        held = self.mean(active.astype(self.share.dtype)[:, None])[:, 0] > 0.5
+        return replace(self, behind=self.behind & held, share=jnp.where(held, self.share, 0))
+
+    def _by_rows(self, function: Callable[..., Any], *fields: Array) -> Any:
+        """A function of rows, their shares, and fields of nodes: of rows near the surface, or of all without room."""
+
+        def over(rows: _Rows, *fields: Array) -> Any:
+            return function(rows, rows.of(self.share), *fields)
+
+        every = _Rows(jnp.arange(len(self.height)), self.stencil, self.height, self.normal)
+        return jax.lax.cond(self.fits, partial(over, self.near), partial(over, every), *fields)
 
     def mean(self, field: Float[Array, "n c"]) -> Float[Array, "n c"]:
         """Σ_k τ_ik f_k."""
 
-        def followed(field: Float[Array, "n c"]) -> Float[Array, "n c"]:
-            return (self.part[..., None] * field[self.parents]).sum(axis=0)
+        def followed(rows: _Rows, share: Array, leading: Array) -> Array:
+            return rows.laid((share * gather(rows.stencil, leading)[0]).T, leading)
 
-        return jax.lax.cond(self.part.any(), followed, jnp.zeros_like, field)  # sums cost most of a map
+        return self._by_rows(followed, self.parents[:, None] * field)
 
     def spread(self, field: Float[Array, "n c"]) -> Float[Array, "n c"]:
         """Σ_i τ_ik f_i."""
@@ -73,13 +110,18 @@ class SurfaceImage(eqx.Module):
 
     def vector(self, field: NodeVector) -> NodeVector:
         """B for a vector field."""
-        if self.sticks:
-            return jnp.where(self.follows[:, None], self.height[:, None] * self.mean(self.inverse * field), field)
-        strain = (self.slope * field).sum(axis=1, keepdims=True)
-        followed = self.mean(jnp.concatenate([field, strain], axis=1))
-        along, strain = followed[:, :-1], followed[:, -1]
-        across = self.height * strain - (self.normal * along).sum(axis=1)
-        return jnp.where(self.follows[:, None], along + across[:, None] * self.normal, field)
+        strain = self.inverse * field if self.sticks else (self.slope * field).sum(axis=1, keepdims=True)
+        leading = self.parents[:, None] * (strain if self.sticks else jnp.concatenate([field, strain], axis=1))
+
+        def following(rows: _Rows, share: Array, leading: Array) -> Array:
+            along, height, normal = (share * gather(rows.stencil, leading)[0]).T, rows.height[:, None], rows.normal
+            if self.sticks:
+                return rows.laid(height * along, leading)
+            along, strain = along[:, :-1], along[:, -1:]
+            across = height * strain - (normal * along).sum(axis=1, keepdims=True)
+            return rows.laid(along + across * normal, leading)
+
+        return jnp.where(self.follows[:, None], 0, field) + self._by_rows(following, leading)
 
     def fold_scalar(self, field: Array) -> Array:
         """Bᵀ for an even scalar field, shape (n,), or for several in columns."""
@@ -89,28 +131,38 @@ class SurfaceImage(eqx.Module):
         """Bᵀ for a vector field."""
         return jax.linear_transpose(self.vector, field)(field)[0]
 
-    def fold_masses(self, masses: Float[Array, "n d d"]) -> Float[Array, "n d d"]:
+    def fold_masses(self, masses: Float[Array, "n d d"], mass: NodeScalar) -> tuple[Float[Array, "n d d"], NodeScalar]:
         """The masses of parents, Σ τ_ik G_ikᵀ M_i G_ik with v_i = Σ τ_ik G_ik v_k: as much as BᵀMB or more, for any
-        velocity."""
-        d, n, height, slope = masses.shape[-1], self.normal, self.height[:, None], self.slope
+        velocity; and Bᵀ of a mass."""
+        d, size, slope = masses.shape[-1], len(mass), self.slope
+
+        def taken_from(rows: _Rows, share: Array, masses: Array, mass: Array) -> Array:
+            M, n, height = rows.of(masses), rows.normal, rows.height[:, None]
+            if self.sticks:
+                parts = [height**2 * M.reshape(-1, d * d)]
+            else:
+                pushed = (M * n[:, None]).sum(axis=2)  # M n
+                across = (pushed * n).sum(axis=1, keepdims=True)
+                bent = pushed - across * n  # (1 − n nᵀ) M n
+                along = M - n[:, :, None] * pushed[:, None] - bent[:, :, None] * n[:, None]
+                parts = [along.reshape(-1, d * d), height * bent, height**2 * across]
+            return scatter(
+                rows.stencil, share * jnp.concatenate([*parts, rows.of(mass)[:, None]], axis=1).T, None, size
+            )
+
+        taken = self.parents[:, None] * self._by_rows(taken_from, masses, mass)
+        around, mass = taken[:, : d * d].reshape(masses.shape), jnp.where(self.follows, 0, mass + taken[:, -1])
         if self.sticks:
-            parts = jnp.where(self.follows[:, None], height**2 * masses.reshape(-1, d * d), 0)
-            taken = (self.inverse**2 * self.spread(parts)).reshape(masses.shape)
-            return jnp.where(self.follows[:, None, None], 0, masses + taken)
-        pushed = (masses * n[:, None]).sum(axis=2)  # M n
-        across = (pushed * n).sum(axis=1, keepdims=True)
-        bent = pushed - across * n  # (1 − n nᵀ) M n
-        along = masses - n[:, :, None] * pushed[:, None] - bent[:, :, None] * n[:, None]
-        parts = jnp.concatenate([along.reshape(-1, d * d), height * bent, height**2 * across], axis=1)
-        taken = self.spread(jnp.where(self.follows[:, None], parts, 0))
-        mixed = (taken[:, d * d : -1] + taken[:, -1:] * slope / 2)[:, None] * slope[:, :, None]
-        taken = taken[:, : d * d].reshape(-1, d, d) + mixed + mixed.swapaxes(1, 2)
-        return jnp.where(self.follows[:, None, None], 0, masses + taken)
+            around = self.inverse[:, None] ** 2 * around
+        else:
+            mixed = (taken[:, d * d : -2] + taken[:, -2:-1] * slope / 2)[:, None] * slope[:, :, None]
+            around = around + mixed + mixed.swapaxes(1, 2)
+        return jnp.where(self.follows[:, None, None], 0, masses + around), mass
 
     def reached(self, shape: tuple[int, ...]) -> Mask:
         """All components of velocity of what follows and is followed, a mask of this shape (n, d)."""
         follows = self.follows
-        touched = follows | (self.spread(follows[:, None].astype(self.part.dtype))[:, 0] > 0)
+        touched = follows | (self.spread(follows[:, None].astype(self.share.dtype))[:, 0] > 0)
         return jnp.broadcast_to(touched[:, None], shape)
 
     def carried(self, dim: int) -> Mask:
@@ -158,15 +210,13 @@ def surface_image(
     layer = np.repeat(np.arange(grid.layers), grid.size // grid.layers)
     place = grid.nodes(window) + (jnp.where(sloping, first + 0.5 - height, 0) * dx)[:, None] * normal
     stencil = make_stencil(BSpline(2), MLSGradient(), grid, window, place, layer=None if grid.layers == 1 else layer)
-    behind = (height < first) & (height > -(order + 3) / 2) & sloping & stencil.inside
-    image = SurfaceImage(
-        parents=jnp.clip(stencil.index, 0, grid.size - 1),
-        part=jnp.where(behind, stencil.weight, 0),
-        height=height,
-        normal=normal,
-        velocity=velocity,
-        sticks=sticks,
-    )
+    behind = (height < first) & (height > -(order + 3) / 2) & sloping & stencil.inside & filled.any()
+    fields = (jnp.where(behind, field, 0) for field in (stencil.first, stencil.offset))  # elsewhere in the window too
+    stencil = replace(stencil, **dict(zip(("first", "offset"), fields, strict=True)))
+    number = jnp.nonzero(behind, size=-(-len(height) // _NEAR), fill_value=len(height))[0].astype(jnp.int32)
+    near, fits = _Rows(number, stencil.of(number), height[number], normal[number]), behind.sum() <= len(number)
+    ones = jnp.ones_like(height)
+    image = SurfaceImage(stencil, height, normal, near, fits, ones, behind, ones, velocity, sticks)
     return image.taking(filled & (height >= first) & (height < first + 2))
 
 
