@@ -1,15 +1,16 @@
 """Do fits find what other codes and closed forms made, and do their intervals hold it?
 
-    python benchmarks/wild_fits.py [--only twist,sand] [--draws 2] [--one-grid] [--refine]
+    python benchmarks/wild_fits.py [--only twist,sand] [--draws 2] [--finer 4] [--one-grid] [--refine]
     python benchmarks/wild_fits.py --false-minima [--draws 20]
 
-Motions of a square by an MLS-MPM in NumPy (`peers/numpy_mpm.py`) on a grid four times finer than the fit's: stretched,
-sheared or twisted as it starts, dropped on a floor, slumping on one that holds it, as two elastic solids; stretched
-for four periods; of a disc that is dropped (fitted once more with the floor's height), a tower that sways, an L that
-spins and stretches; a fluid and sand that collapse. By closed forms: a standing wave, a bar that vibrates, a block that
-is pressed. Markers (of the press force and width) are seen with noise of 1 % of the amplitude. `mpm.fit` finds E and ν
-(E alone of wave and bar, the viscosity, the friction angle), from starts within half a decade, as it does by default;
-with --one-grid it does not look at twice the spacing; with --refine `fit_refined` fits on twice as many cells too.
+Motions of a square by an MLS-MPM in NumPy (`peers/numpy_mpm.py`) on a grid `--finer` times as fine as the fit's:
+stretched, sheared or twisted as it starts, dropped on a floor, slumping on one that holds it, as two elastic solids;
+stretched for four periods; of a disc that is dropped (fitted once more with the floor's height), a tower that sways, an
+L that spins and stretches; a fluid and sand that collapse. By closed forms: a standing wave, a bar that vibrates, a
+block that is pressed. Markers (of the press force and width) are seen with noise of 1 % of the amplitude. `mpm.fit`
+finds E and ν (E alone of wave and bar, the viscosity, the friction angle), from starts within half a decade, as it does
+by default; with --one-grid it does not look at twice the spacing; with --refine `fit_refined` fits on twice as many
+cells too.
 
 A line a number: the truth, the estimate, its error, both intervals, and the width of the first over the error. Then,
 for all and for the motions that the rule of the intervals was not developed on, how many hold the truth.
@@ -37,7 +38,7 @@ from mpmjax.verification import StandingWave, VibratingBar, discretise
 E, NU, DENSITY, SIDE, CELLS, DT, STEPS = 5e4, 0.3, 1e3, 0.4, 8, 2e-3, 60
 ETA, PHI = 20.0, np.radians(30.0)
 MU, LAM = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
-CORNER, FINER, EVERY, GRAVITY = 0.4, 4, 4, 9.81
+CORNER, EVERY, GRAVITY = 0.4, 4, 9.81
 MARKERS = np.array([[a, b] for a in (0.05, 0.15, 0.25, 0.35) for b in (0.05, 0.2, 0.35, 0.5, 0.65)])
 DEVELOPED = "stretch", "shear", "bounce", "bar"
 ON_A_FLOOR, SMOOTH = ("bounce", "disc", "slump", "tower", "fluid", "sand"), ("bounce", "disc", "fluid")
@@ -97,9 +98,9 @@ def markers(scene: str) -> np.ndarray:
     return MARKERS[np.asarray(region(scene).distance(jnp.asarray(MARKERS))) < 0]
 
 
-def truth(scene: str, law: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times and places of the markers by the peer."""
-    count, spacing = 2 * CELLS * FINER, SIDE / CELLS / FINER
+def truth(scene: str, law: str, finer: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times and places of the markers by the peer, on so much finer a grid."""
+    count, spacing = 2 * CELLS * finer, SIDE / CELLS / finer
     line = (np.arange(2 * count) + 0.5) * SIDE / count
     X = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
     X = X[np.asarray(region(scene).distance(jnp.asarray(X))) < 0]
@@ -116,9 +117,9 @@ def truth(scene: str, law: str) -> tuple[np.ndarray, np.ndarray]:
         volume=(SIDE / count) ** 2,
         spacing=spacing,
         law=laws[law](),
-        dt=DT / FINER,
-        steps=steps_of(scene) * FINER,
-        every=EVERY * FINER,
+        dt=DT / finer,
+        steps=steps_of(scene) * finer,
+        every=EVERY * finer,
         gravity=GRAVITY if scene in ON_A_FLOOR else 0.0,
         floor=CORNER if scene in ON_A_FLOOR else None,
         sticks=scene not in SMOOTH,
@@ -201,7 +202,7 @@ def pressed(seed: int, n: int) -> mpm.Experiment:
     return mpm.Experiment(of, q, t1=t1, dt=t1 / (40 * n), method=mpm.BackwardEuler(), observations=seen)
 
 
-def cases(draws: int, only: list[str]) -> Iterator[Case]:
+def cases(draws: int, only: list[str], finer: int) -> Iterator[Case]:
     """The fits whose names have one of some parts, one after the other."""
     elastic = ("stretch", "shear", "twist", "bounce", "slump")
     motions = [(scene, law) for scene in elastic for law in ("NeoHookean", "FixedCorotated")]
@@ -220,7 +221,7 @@ def cases(draws: int, only: list[str]) -> Iterator[Case]:
                 yield Case(name, build, {"E": mpm.Positive(stiffness, start=true * factor)}, {"E": true})
                 continue
             if law:
-                times, x = exact = truth(scene, law) if exact is None else exact
+                times, x = exact = truth(scene, law, finer) if exact is None else exact
                 sigma = 0.01 * float(np.ptp(x - x[:1], axis=0).max())
                 build = partial(moved, scene, law, times, x + sigma * rng.normal(size=x.shape), sigma)
             if law == "fluid":
@@ -240,9 +241,9 @@ def cases(draws: int, only: list[str]) -> Iterator[Case]:
                     yield Case(f"{name}, height", build, {**both, "height": height}, {"E": E, "nu": NU})
 
 
-def false_minima(draws: int) -> None:
+def false_minima(draws: int, finer: int) -> None:
     """How often a vibration's fits find the minimum that a fit from the truth does."""
-    times, x = truth("vibration", "NeoHookean")
+    times, x = truth("vibration", "NeoHookean", finer)
     sigma, held = 0.01 * float(np.ptp(x - x[:1], axis=0).max()), np.zeros(2, int)
     for draw in range(draws):
         rng = np.random.default_rng(draw)
@@ -261,6 +262,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="parts of the names, parted by commas")
     parser.add_argument("--draws", type=int, help="of the noise; default 2, of false minima 20")
+    parser.add_argument("--finer", type=int, default=4, help="how much finer the peer's grid is; default 4")
     parser.add_argument("--false-minima", action="store_true")
     parser.add_argument("--one-grid", action="store_true")
     parser.add_argument("--refine", action="store_true")
@@ -268,10 +270,10 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     warnings.simplefilter("ignore")
     if asked.false_minima:
-        return false_minima(asked.draws or 20)
+        return false_minima(asked.draws or 20, asked.finer)
     rows: list[tuple[bool, bool, bool, float]] = []
     print("motion                             number, truth, estimate: error, interval (by noise alone), width/error")
-    for case in cases(asked.draws or 2, asked.only.split(",")):
+    for case in cases(asked.draws or 2, asked.only.split(","), asked.finer):
         begun = time.perf_counter()
         if asked.refine:
             result: Any = mpm.fitting.fit_refined(case.build, case.parameters)

@@ -66,13 +66,35 @@ MPMJAX_INLINE void write(const T* from, int count, T* to) {
   prefetch_block<true>(to);
 }
 
-// Columns of a block as rows: row q has the q-th number of each column, and zeros.
+// Two vectors' lanes in turn, so many of each at a time: of their first halves, or of their second ones.
+template <int together, int half, int lanes, int... lane>
+constexpr auto in_turn(std::integer_sequence<int, lane...>) {
+  return std::integer_sequence<int, (half * lanes / 2 + lane / (2 * together) * together + lane % together +
+                                     lane / together % 2 * lanes)...>();
+}
+template <class T, int together, int half>
+MPMJAX_INLINE Simd<T> zipped(Simd<T> a, Simd<T> b) {
+  constexpr int lanes = kSimdLanes<T>;
+  return shuffled(a, b, LanesOf<T, lanes>(), in_turn<together, half, lanes>(Count<lanes>()));
+}
+
+// Four columns of a vector of particles as rows, one for each.
+template <class T>
+MPMJAX_INLINE void to_rows(const Simd<T>* columns, Vector<T>* rows) {
+  const Simd<T> pairs[] = {zipped<T, 1, 0>(columns[0], columns[1]), zipped<T, 1, 0>(columns[2], columns[3]),
+                           zipped<T, 1, 1>(columns[0], columns[1]), zipped<T, 1, 1>(columns[2], columns[3])};
+  const Simd<T> fours[] = {zipped<T, 2, 0>(pairs[0], pairs[1]), zipped<T, 2, 1>(pairs[0], pairs[1]),
+                           zipped<T, 2, 0>(pairs[2], pairs[3]), zipped<T, 2, 1>(pairs[2], pairs[3])};
+  std::memcpy(rows, fours, sizeof fours);
+}
+
+// The same of a block's columns, and zeros in those that there are not.
 template <class T, int columns>
 MPMJAX_INLINE void to_rows(const T (*from)[kBlock], Vector<T>* rows) {
-  for (int q = 0; q < kBlock; q += kLanes) {
-    Vector<T> turned[kLanes] = {};
-    for (int c = 0; c < columns; ++c) turned[c] = load_as<Vector<T>>(from[c] + q);
-    transpose<T>(turned, rows + q);
+  for (int q = 0; q < kBlock; q += kSimdLanes<T>) {
+    Simd<T> read[kLanes] = {};
+    for (int c = 0; c < columns; ++c) read[c] = load_as<Simd<T>>(from[c] + q);
+    to_rows<T>(read, rows + q);
   }
 }
 
@@ -113,46 +135,39 @@ struct Block {
     }
   }
 
-  template <int order>
-  MPMJAX_INLINE void set(const mpmjax::Basis<T>& basis, int a, const T* t, int count, const T* factor) {
-    polynomials<order>(basis, basis.weights, t, count, factor, weights[a]);
-    polynomials<order>(basis, basis.slopes, t, count, factor, slopes[a]);
-  }
-
   // Σ_k c_k (t − τ)^k for each node, or the derivative Σ_k k c_k (t − τ)^(k−1), times a factor if there is one.
   template <int order>
-  static MPMJAX_INLINE void polynomials(const mpmjax::Basis<T>& basis, const T (*c)[mpmjax::kMostTerms], const T* t,
-                                        int count, const T* factor, T (*to)[kBlock]) {
+  MPMJAX_INLINE void set(const mpmjax::Basis<T>& basis, int a, const T* t, int count, const T* factor) {
     for (int q = 0; q < kBlock; q += kSimdLanes<T>) {
-      Simd<T> x[s], sum[s] = {};
-#pragma GCC unroll 4
-      for (int i = 0; i < s; ++i) x[i] = load_as<Simd<T>>(t + q) - basis.knots[i];
+      Simd<T> sums[2][s] = {};
       for (int k = basis.terms - 1; k >= order; --k) {
+        const T times = order == 1 ? T(k) : T(1);
 #pragma GCC unroll 4
-        for (int i = 0; i < s; ++i) sum[i] = sum[i] * x[i] + (order == 1 ? k * c[i][k] : c[i][k]);
+        for (int i = 0; i < s; ++i) {
+          const Simd<T> x = load_as<Simd<T>>(t + q) - basis.knots[i];
+          sums[0][i] = sums[0][i] * x + times * basis.weights[i][k];
+          sums[1][i] = sums[1][i] * x + times * basis.slopes[i][k];
+        }
       }
+      const Simd<T> by = factor == nullptr ? Simd<T>{} + 1 : load_as<Simd<T>>(factor + q);
 #pragma GCC unroll 4
-      for (int i = 0; i < s; ++i) store(to[i] + q, factor == nullptr ? sum[i] : sum[i] * load_as<Simd<T>>(factor + q));
+      for (int i = 0; i < s; ++i) store(weights[a][i] + q, by * sums[0][i]), store(slopes[a][i] + q, by * sums[1][i]);
     }
-    for (int i = 0; i < s && count < kBlock; ++i) std::memset(to[i] + count, 0, (kBlock - count) * sizeof(T));
+    for (int i = 0; i < s && count < kBlock; ++i) {
+      std::memset(weights[a][i] + count, 0, (kBlock - count) * sizeof(T));
+      std::memset(slopes[a][i] + count, 0, (kBlock - count) * sizeof(T));
+    }
   }
 
-  // Stores numbers of a block, those of no particle as zero.
-  template <class V, class X>
-  static MPMJAX_INLINE void put(V numbers, int count, X* to) {
-    std::memcpy(to, &numbers, sizeof numbers);
-    for (int q = count; q < kBlock; ++q) to[q] = 0;
-  }
-
-  // The index terms of an axis, (first + i) stride or around a periodic one, with zero for no particle. They wrap as
-  // 32-bit integers do: those of a particle outside of the window have no meaning, and may be any number.
+  // The index terms of an axis, (first + i) stride or around a periodic one; for no particle those from node 0 on. They
+  // wrap as 32-bit integers do: those of a particle outside of the window have no meaning, and may be any number.
   MPMJAX_INLINE void read_index(const Stencils<T>& from, int a, int64_t first, int count) {
     int32_t begin[kBlock];
     copy(from.first + a * from.particles + first, count, begin);
     const uint32_t stride = static_cast<uint32_t>(from.basis.strides[a]);
     const BlockUint node = load_as<BlockUint>(begin);
 #pragma GCC unroll 4
-    for (int i = 0; i < s; ++i) put((node + i) * stride, count, index[a][i]);
+    for (int i = 0; i < s; ++i) store(index[a][i], (node + i) * stride);
     if (from.basis.periodic[a]) wrap_index(from.basis.shape[a], stride, begin, count, index[a]);
   }
 
@@ -174,22 +189,21 @@ struct Block {
     to_rows<T, s>(slopes[d - 1], last_slopes);
   }
 
-  // The range of flat indices, from the terms of the index alone. Where a term is so large that a sum may leave 32 bits
-  // and wrap, the range is that of all integers.
+  // The range of flat indices, from the terms of the index alone. Where a term is negative or so large that a sum may
+  // leave 32 bits and wrap, the range is that of all integers. Terms of an axis that is not periodic grow.
   MPMJAX_NOINLINE void find_range(const Stencils<T>& from, int64_t first, int count) {
     BlockInt large = {}, bent = {}, low_sum = {}, high_sum = {};
+#pragma GCC unroll 3
     for (int a = d - 1; a >= 0; --a) {
-      BlockInt first_term = {}, low = {}, high = {};
       read_index(from, a, first, count);
-#pragma GCC unroll 4
-      for (int i = 0; i < s; ++i) {
+      BlockInt low = load_as<BlockInt>(index[a][0]), high = load_as<BlockInt>(index[a][s - 1]);
+      for (int i = 0; i < s && from.basis.periodic[a]; ++i) {
         const BlockInt term = load_as<BlockInt>(index[a][i]);
-        if (i == 0) first_term = low = high = term;
+        if (a == d - 1) bent |= term ^ wrapping_sum(load_as<BlockInt>(index[a][0]), BlockInt{} + i);
         low = term < low ? term : low;
         high = term > high ? term : high;
-        large |= (term ^ (term >> 31)) >> kSafeBits;
-        if (a == d - 1) bent |= term ^ wrapping_sum(first_term, BlockInt{} + i);
       }
+      large |= low | high | from.basis.strides[a];
       if (a == 0) put(low_sum, high_sum, large, least_beyond, most_beyond);
       low_sum = wrapping_sum(low_sum, low);
       high_sum = wrapping_sum(high_sum, high);
@@ -211,8 +225,9 @@ struct Block {
   }
 
   static MPMJAX_INLINE void put(BlockInt low, BlockInt high, BlockInt large, int32_t* to_least, int32_t* to_most) {
-    store(to_least, large != 0 ? BlockInt{} + INT32_MIN : low);
-    store(to_most, large != 0 ? BlockInt{} + INT32_MAX : high);
+    const BlockInt all = large >> kSafeBits;
+    store(to_least, all != 0 ? BlockInt{} + INT32_MIN : low);
+    store(to_most, all != 0 ? BlockInt{} + INT32_MAX : high);
   }
 
   // The flat index of the j-th node of a row, in C order of the axes before the last. It wraps, as read_index says.

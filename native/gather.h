@@ -265,6 +265,12 @@ void g2p(const G2P<T>& task, int64_t first, int64_t last) {
       const Nodes<T, d, s, d> nodes(block, q, task.nodes, task.size, d, 0);
       const auto sums = nodes.gather();
       const ParticleLanes<T> lanes(start + q, last, task.stencils.particles);
+      for (int r = 0; r < d * d; ++r) {
+        const int64_t place = r * task.stencils.particles + start + q;
+        if (r < d) prefetch<true>(task.value + place), prefetch<true>(task.moved + place);
+        prefetch<true>(task.gradient + place);
+        if (task.F != nullptr) prefetch<true>(task.strained + place);
+      }
       by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
         Simd<T> gradient[d][d];
         for (int r = 0; r < d; ++r) {

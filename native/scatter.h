@@ -63,7 +63,10 @@ void wipe(T* numbers, int64_t size, int64_t first, int64_t last) {
 // The least and the largest of a block's numbers; min_element's search would take branches.
 MPMJAX_INLINE Range range_of(const int32_t* least, const int32_t* most, int count) {
   Range range = {least[0], most[0]};
-  for (int q = 1; q < count; ++q) range = {std::min(range.least, least[q]), std::max(range.most, most[q])};
+  const auto extend = [&](int count) MPMJAX_INLINE_LAMBDA {
+    for (int q = 1; q < count; ++q) range = {std::min(range.least, least[q]), std::max(range.most, most[q])};
+  };
+  count == kBlock ? extend(kBlock) : extend(count);
   return range;
 }
 
@@ -359,7 +362,6 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
   const int64_t particles = task.stencils.particles;
   const T spacing = 1 / task.slope[0], factor = task.factor[0] * task.slope[0];
   const auto give = [&](const auto&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
-    alignas(64) T columns[d + 1][d + 1][kBlock] = {};  // of the value, and of the gradient along each axis
     for (int q = 0; q < count; q += kSimdLanes<T>) {
       const ParticleLanes<T> lanes(start + q, start + count, particles);
       by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
@@ -368,29 +370,31 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
           return lanes.template load<all>(array, row);
         };
         const V m = read(task.mass, 0);
-        for (int r = 0; r < d; ++r) store(columns[0][r] + q, m * read(task.v, r));
-        store(columns[0][d] + q, m);
-        V A[d][d] = {}, B[d][d] = {}, C[d][d] = {};
+        V given[kLanes] = {};
+        for (int r = 0; r < d; ++r) given[r] = m * read(task.v, r);
+        given[d] = m;
+        to_rows<T>(given, rows[0] + q);
+        given[d] = V{};
+        V A[d][d], B[d][d], C[d][d];
         for (int r = 0; r < d; ++r) {
           for (int b = 0; b < d; ++b) {
-            if (task.C != nullptr) C[r][b] = m * read(task.C, d * r + b);
-            if (task.A != nullptr) A[r][b] = factor * read(task.A, d * r + b);
-            if (task.B != nullptr) B[r][b] = read(task.B, d * r + b);
+            C[r][b] = task.C == nullptr ? V{} : m * read(task.C, d * r + b);
+            A[r][b] = task.A == nullptr ? V{} : factor * read(task.A, d * r + b);
+            B[r][b] = task.B == nullptr ? V{} : read(task.B, d * r + b);
           }
         }
         for (int b = 0; b < d; ++b) {
           V moment = V{} + (s == 3 ? T(1) / 4 : T(1) / 3);
           if (s == 2) moment = T(0.25) - read(task.stencils.offset, b) * read(task.stencils.offset, b);
           for (int r = 0; r < d; ++r) {
-            V sum = spacing * moment * C[r][b];
-            if (task.A != nullptr && task.B == nullptr) sum += A[r][b];
-            for (int k = 0; k < d && task.B != nullptr; ++k) sum += A[r][k] * B[b][k];
-            store(columns[b + 1][r] + q, sum);
+            given[r] = spacing * moment * C[r][b];
+            if (task.A != nullptr && task.B == nullptr) given[r] += A[r][b];
+            for (int k = 0; k < d && task.B != nullptr; ++k) given[r] += A[r][k] * B[b][k];
           }
+          to_rows<T>(given, rows[b + 1] + q);
         }
       });
     }
-    for (int b = 0; b <= d; ++b) to_rows<T, d + 1>(columns[b], rows[b]);
   };
   average_of<T, d, s>(task, first, last, [&] {
     const NodeSums<T, s, d + 1> nodes(task.sums, d + 1, 0, first, last);
