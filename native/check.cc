@@ -215,14 +215,14 @@ void check_moves(const Example<T>& e, std::mt19937& random, const std::vector<co
   const int d = sh.d, m = d * d;
   const int64_t p = sh.particles, n = sh.size();
   const Array<T> slope(sh.batch), factor(sh.batch), least(sh.batch), mass(sh.batch * p), x(sh.batch * d * p);
-  const Array<T> A(sh.batch * m * p), B(A), C(A), values(sh.batch * (d + 1) * p), gradients(A);
-  for (const Array<T>* array : {&slope, &factor, &mass, &x, &A, &B, &C}) array->draw(random);
+  const Array<T> q(mass), even(mass), A(sh.batch * m * p), B(A), C(A), values(sh.batch * (d + 1) * p), gradients(A);
+  for (const Array<T>* array : {&slope, &factor, &mass, &q, &even, &x, &A, &B, &C}) array->draw(random);
   for (const Array<T>* array : {&mass, &slope, &least}) {
     for (int64_t i = 0; i < array->size; ++i) (*array)[i] = 1 + std::abs((*array)[i]);
   }
   const Array<T> whole(sh.batch * n), means(sh.batch * n * d), sums(sh.batch * n * (d + 1));
-  for (int kind = 0; kind < 4; ++kind) {  // both terms, C alone, A Bᵀ alone, A alone
-    const bool affine = kind < 2, pushed = kind != 1, factored = pushed && kind < 3;
+  for (int kind = 0; kind < 5; ++kind) {  // both terms, C alone, A Bᵀ alone, A alone, q B Bᵀ + r I alone
+    const bool affine = kind < 2, pushed = kind != 1, isotropic = kind == 4, factored = pushed && kind != 3;
     for (int64_t i = 0; i < sh.batch * p; ++i) {
       const int64_t b = i / p, k = i % p;
       const auto at = [&](const Array<T>& a, int64_t rows, int64_t row) -> T& { return a[(b * rows + row) * p + k]; };
@@ -232,8 +232,10 @@ void check_moves(const Example<T>& e, std::mt19937& random, const std::vector<co
         const double t = e.offset[(b * d + c) * p + k];
         const double moment = sh.s == 2 ? 0.25 - t * t : sh.s == 3 ? 1 / 4.0 : 1 / 3.0;
         for (int r = 0; r < d; ++r) {
-          double product = factored ? 0 : at(A, m, d * r + c);
-          for (int l = 0; l < d && factored; ++l) product += double(at(A, m, d * r + l)) * at(B, m, d * c + l);
+          double product = isotropic ? r == c ? double(even[i]) : 0 : factored ? 0 : at(A, m, d * r + c);
+          for (int l = 0; l < d && factored; ++l) {
+            product += (isotropic ? double(q[i]) * at(B, m, d * r + l) : at(A, m, d * r + l)) * at(B, m, d * c + l);
+          }
           const double turned = double(mass[i]) * at(C, m, d * r + c) * moment / slope[b];
           at(gradients, m, d * c + r) = T((pushed ? product * factor[b] * slope[b] : 0) + (affine ? turned : 0));
         }
@@ -247,7 +249,8 @@ void check_moves(const Example<T>& e, std::mt19937& random, const std::vector<co
       expected.add(i, means[i], 100 * (1 + std::abs(means[i])));
     }
     const P2G<T> task = {e.stencils(false), least.get(), slope.get(), factor.get(), mass.get(), x.get(),
-                         affine ? C.get() : nullptr, pushed ? A.get() : nullptr, factored ? B.get() : nullptr,
+                         affine ? C.get() : nullptr, pushed && !isotropic ? A.get() : nullptr,
+                         factored ? B.get() : nullptr, isotropic ? q.get() : nullptr, isotropic ? even.get() : nullptr,
                          whole.get(), means.get(), sums.get(), nullptr, nullptr, n, d + 1};
     by_all(pools, "a P2G", [&](const Pool& pool) { p2g(pool, sh.batch, task); }, whole, means);
     compare("P2G", sh, means, expected);

@@ -142,7 +142,8 @@ struct Average {
 };
 
 // An average of what particles have: of v, weighted with their mass, and the gradients a_b = m C_b D_b + factor (A Bᵀ)_b
-// in spacings, with the moment D of the weights. C or A may be null, and B where it is the identity.
+// in spacings, with the moment D of the weights. C or A may be null, and B where it is the identity. Where there are
+// numbers q and r of each particle, q B Bᵀ + r I stands for A Bᵀ.
 template <class T>
 struct P2G {
   Stencils<T> stencils;
@@ -151,6 +152,7 @@ struct P2G {
   const T* factor;
   const T *mass, *v;
   const T *C, *A, *B;   // of each particle d rows of d
+  const T *q, *r;
   T *whole, *means, *sums;  // as in an average, and so the next
   const Range* ranges;
   const bool* reached;
@@ -161,7 +163,7 @@ struct P2G {
   void arrays(const F& f) {
     const int64_t d = stencils.basis.d, p = stencils.particles;
     stencils.arrays(f), f(least, {}), f(slope, {}), f(factor, {}), f(mass, {p}), f(v, {d, p});
-    f(C, {d, d, p}), f(A, {d, d, p}), f(B, {d, d, p});
+    f(C, {d, d, p}), f(A, {d, d, p}), f(B, {d, d, p}), f(q, {p}), f(r, {p});
     f(whole, {size}), f(means, {size, d}), f(sums, {size, columns}), f(reached, {blocks_of(size)});
   }
 };

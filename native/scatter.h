@@ -362,25 +362,27 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
   const int64_t particles = task.stencils.particles;
   const T spacing = 1 / task.slope[0], factor = task.factor[0] * task.slope[0];
   const auto give = [&](const auto&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
-    for (int q = 0; q < count; q += kSimdLanes<T>) {
-      const ParticleLanes<T> lanes(start + q, start + count, particles);
+    for (int k = 0; k < count; k += kSimdLanes<T>) {
+      const ParticleLanes<T> lanes(start + k, start + count, particles);
       by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
         const auto read = [&](const T* array, int row) MPMJAX_INLINE_LAMBDA {
-          prefetch(array + row * particles + start + q);
+          prefetch(array + row * particles + start + k);
           return lanes.template load<all>(array, row);
         };
         const V m = read(task.mass, 0);
         V given[kLanes] = {};
         for (int r = 0; r < d; ++r) given[r] = m * read(task.v, r);
         given[d] = m;
-        to_rows<T>(given, rows[0] + q);
+        to_rows<T>(given, rows[0] + k);
         given[d] = V{};
+        const V q = task.q == nullptr ? V{} : factor * read(task.q, 0);
+        const V even = task.r == nullptr ? V{} : factor * read(task.r, 0);
         V A[d][d], B[d][d], C[d][d];
         for (int r = 0; r < d; ++r) {
           for (int b = 0; b < d; ++b) {
             C[r][b] = task.C == nullptr ? V{} : m * read(task.C, d * r + b);
-            A[r][b] = task.A == nullptr ? V{} : factor * read(task.A, d * r + b);
             B[r][b] = task.B == nullptr ? V{} : read(task.B, d * r + b);
+            A[r][b] = task.A == nullptr ? q * B[r][b] : factor * read(task.A, d * r + b);
           }
         }
         for (int b = 0; b < d; ++b) {
@@ -389,9 +391,10 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
           for (int r = 0; r < d; ++r) {
             given[r] = spacing * moment * C[r][b];
             if (task.A != nullptr && task.B == nullptr) given[r] += A[r][b];
-            for (int k = 0; k < d && task.B != nullptr; ++k) given[r] += A[r][k] * B[b][k];
+            for (int l = 0; l < d && task.B != nullptr; ++l) given[r] += A[r][l] * B[b][l];
           }
-          to_rows<T>(given, rows[b + 1] + q);
+          given[b] += even;
+          to_rows<T>(given, rows[b + 1] + k);
         }
       });
     }

@@ -275,6 +275,7 @@ def far_away(particles, count):
     return replace(particles, x=particles.x.at[rows].set(place.astype(particles.x.dtype)), mass=mass, volume=volume)
 
 
+@pytest.mark.thorough
 def test_what_is_not_there_is_in_no_measure():
     """Nor in averages of volumes, and in the longest step it counts as its material."""
     grid, law = mpm.Grid((30, 30), 0.1, origin=(-5, -5)), LAWS["neo_hookean"]

@@ -155,6 +155,11 @@ class WrongStress(Gel):
         return self.mu * F
 
 
+class WrongNumbers(Gel):
+    def kirchhoff_numbers(self, F):
+        return self.mu, self.mu
+
+
 class WrongDifferential(Gel):
     def stress_differential(self, F):
         return Gel(1.1 * self.mu, self.lam).stress_differential(F)
@@ -182,6 +187,7 @@ class Turning(Gel):
 
 FAULTS = {
     WrongStress: r"^WrongStress: stress is off by .* of its size at F = \[\[",
+    WrongNumbers: r"^WrongNumbers: kirchhoff_numbers is off by .* of its size at F = \[\[",
     WrongDifferential: r"^WrongDifferential: stress_differential is off by 0.0",
     WrongFrame: r"^WrongFrame: principal_differential is off by 0.0",
     Kinked: r"^Kinked: the energy's gradient is not finite at F = \[\[1., 0.\], \[0., 1.\]\]",

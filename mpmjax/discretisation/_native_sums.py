@@ -135,9 +135,11 @@ def call_p2g(
     """`p2g_sum`, but for stencils with gradients of their own or without any."""
     if stencil.own_derivatives is not None or stencil.flat is not None or (C is None and impulse is None):
         return None
-    factor, *factors = (jnp.zeros_like(least), None, None) if impulse is None else impulse
-    operands = [stencil.first, stencil.offset, least, stencil.slope, factor, mass, v, C, *factors]
-    told = dict(zip(("affine", "pushed", "factored"), (a is not None for a in operands[-3:]), strict=True))
+    factor, A, B = (jnp.zeros_like(least), None, None) if impulse is None else impulse
+    A, q, r = (None, *A) if isinstance(A, tuple) else (A, None, None)
+    operands = [stencil.first, stencil.offset, least, stencil.slope, factor, mass, v, C, A, B, q, r]
+    names = "affine", "pushed", "factored", "isotropic"
+    told = dict(zip(names, (a is not None for a in operands[7:11]), strict=True))
     d = v.shape[-2]
     shapes = (size,), (size, d), (size, d + 1)  # the last one holds the sums before they are divided
     results = [jax.ShapeDtypeStruct(shape, v.dtype) for shape in shapes]

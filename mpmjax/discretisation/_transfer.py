@@ -165,8 +165,9 @@ def without_empty(
     return replace(stencil, flat=reads[:, 0])
 
 
-Impulse = tuple[Scalar, Matrix, Matrix | None]
-"""Factors c, A and B of a matrix c A Bᵀ for each particle; B is None for the identity."""
+Impulse = tuple[Scalar, Any, Any]
+"""Factors c, A and B of a matrix c A Bᵀ for each particle: c A where B is None, c (q B Bᵀ + r I) where A is two
+numbers q and r of each particle."""
 
 
 def p2g(
@@ -188,8 +189,8 @@ def p2g(
         v: v_p [m/s], shape (d, p).
         C: affine velocity [1/s], shape (d, d, p), or None.
         size: number of nodes.
-        impulse: factors of I_p = c A_p B_pᵀ [kg m²/s], c a number, A and B of shape (d, d, p), to add Σ_p I_p g_ip to
-            the momentum in the same sum. g_ip is the moving-least-squares gradient if there is a C.
+        impulse: factors of I_p [kg m²/s], to add Σ_p I_p g_ip to the momentum in the same sum. g_ip is the
+            moving-least-squares gradient if there is a C.
 
     Returns:
         mass m_i [kg], shape (n,), and velocity v_i [m/s], shape (n, d); both are zero on empty nodes.
@@ -213,7 +214,10 @@ def p2g_sum(
     terms = []
     if impulse is not None:
         factor, A, B = impulse
-        terms.append(factor * (A if B is None else la.matmul(A, la.transpose(B))))
+        if isinstance(A, tuple):
+            terms.append(factor * (A[0] * la.matmul(B, la.transpose(B)) + A[1] * la.identity_like(B)))
+        else:
+            terms.append(factor * (A if B is None else la.matmul(A, la.transpose(B))))
     if C is not None:  # w (x_i − x_p) = D g, with g the moving-least-squares gradient
         terms.append(mass * C * stencil.moment)
     gradients = la.transpose(reduce(jnp.add, terms)) if terms else None

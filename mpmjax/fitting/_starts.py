@@ -32,10 +32,8 @@ class Starts(eqx.Module):
     Programming 39 (1987) 57-78). They stand for the others, each linked to the nearest better one, and linked anew
     where that search comes to no minimum.
 
-    A search within a hundredth, in each coordinate, of another with a lower cost is ended, and counted where that one
-    ends; one whose sum of squares three moves have lowered by less than a hundredth, or that goes no further, is ended
-    as at a minimum. Those within twice the least sum of squares are searched on, and the best is then fitted.
-
+    A search that comes near another with a lower cost is counted where that one ends; one that three moves have hardly
+    lowered is ended as at a minimum. Those within twice the least sum of squares are searched on, the best is fitted.
     Two ended at one minimum where their coordinates differ by less than two hundredths, or the misfit hides that:
     Δᵀ JᵀJ Δ ≤ n s² of n coordinates, with J and s² = Σ r²/(m − n) of the better one, s² at least one where σ is given.
     Where it is not, all searches take that of the first one.
@@ -162,10 +160,8 @@ def look_around(
 
     ended = {k for _, numbers in groups for k in numbers}
     minima = tuple(
-        LocalMinimum(
-            problem.by_name(end.z), problem.misfit(end.cost), len(members.keys() & numbers), tuple(sorted(numbers))
-        )
-        for end, numbers in groups
+        LocalMinimum(problem.by_name(end.z), problem.misfit(end.cost), len(members.keys() & ks), tuple(sorted(ks)))
+        for end, ks in groups
     )
     if minima and minima[0].searches == 1 and len(ended & members.keys()) > 1 and not starts.if_needed:
         remark = (

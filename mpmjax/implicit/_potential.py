@@ -5,6 +5,7 @@ import abc
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -93,13 +94,16 @@ class ElasticPotential(eqx.Module):
         P = [points.stress(points.deformation) for points in each] if P is None else P
         return jnp.concatenate([q.weighted_stress(stress, d) for q, stress in zip(each, P, strict=True)], axis=-1)
 
-    def stress_factors(self) -> tuple[Matrix, Matrix | None]:
-        """Factors A and B of `weighted_stress` at u = 0, A Bᵀ: of one material V0 P and F, whose product a sum over
-        particles can form; B is None where they are multiplied."""
+    def stress_factors(self) -> tuple[Any, Matrix | None]:
+        """Factors A and B of `weighted_stress` at u = 0, as `p2g` takes them: of one material V0 P, or the
+        `kirchhoff_numbers` of its law, and F."""
         points, *others = self.material_points
         if others or not points.strained_by_gradient or self.stencil.radius is not None:
             return self.weighted_stress(), None
-        return materialised(points.volume * points.stress(points.deformation)), points.deformation
+        F = points.deformation
+        if points.average is None and (numbers := points.law.kirchhoff_numbers(F)) is not None:
+            return materialised(tuple(points.volume * number for number in numbers)), F
+        return materialised(points.volume * points.stress(F)), F
 
     @property
     def viscous(self) -> bool:

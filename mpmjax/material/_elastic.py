@@ -98,6 +98,12 @@ class NeoHookean(AbstractIsotropic):
         pull, _ = self.volumetric(la.determinant(F))
         return self.shear_modulus * F + pull * la.cofactor(F)
 
+    def kirchhoff_numbers(self, F: Matrix) -> tuple[Array, Array] | None:
+        if type(self).stress is not NeoHookean.stress:  # a law that derives from this one
+            return None
+        J = la.determinant(F)
+        return self.shear_modulus * jnp.ones_like(J), self.volumetric(J)[0] * J
+
     def stress_differential(self, F: Matrix) -> "NeoHookeanDifferential":
         return NeoHookeanDifferential(self, F)
 

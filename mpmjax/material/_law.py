@@ -210,6 +210,11 @@ class AbstractMaterial(AbstractLaw):
         dΨ/dJ, minus the pressure. Default: the energy's gradient."""
         return jax.grad(lambda F: _density(self, F).sum())(F)
 
+    def kirchhoff_numbers(self, F: Matrix, /) -> tuple[Float[Array, "p"], Float[Array, "p"]] | None:
+        """Numbers q and r [Pa] of each particle, shape (p,), with τ = P Fᵀ = q F Fᵀ + r I: all that an explicit step
+        stores of the stress then. Default: None, of a law without."""
+        return None
+
     def stress_differential(self, F: Matrix, /) -> AbstractDifferential:
         """The stress differential ∂²Ψ/∂F∂F at F, a symmetric map. Default: the derivative of the stress, of a law with
         a closed form of `principal_differential` in one direction at a time, else in each of d² as a matrix."""

@@ -9,16 +9,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar, particle_first
 from mpmjax.boundary import AbstractBoundary, mirror, refuse_contact
-from mpmjax.checks import (
-    as_plain,
-    between,
-    checked,
-    coordinates,
-    is_traced,
-    require,
-    require_fields,
-    require_finite,
-)
+from mpmjax.checks import as_plain, between, checked, coordinates, is_traced, require, require_fields, require_finite
 from mpmjax.discretisation import (
     APIC,
     AbstractGradient,

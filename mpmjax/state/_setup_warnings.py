@@ -106,9 +106,8 @@ def _warn_of_thinness(
     for axis in np.flatnonzero(~np.asarray(grid.periodic)):
         thickness = (upper[axis] - lower[axis]) / dx
         walls = (wall for condition in boundary for wall in condition.walls() if wall.axis == axis)
-        if thickness < _THIN - 1e-3 and not any(
-            lower[axis] - dx <= wall.position <= upper[axis] + dx for wall in walls
-        ):
+        beside = any(lower[axis] - dx <= wall.position <= upper[axis] + dx for wall in walls)
+        if thickness < _THIN - 1e-3 and not beside:
             warn(
                 f"{which} is {thickness:.2g} cells thick in direction {axis}, and below {_THIN:g} its stiffness is the "
                 "grid's: take a smaller spacing."

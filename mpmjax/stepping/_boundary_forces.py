@@ -6,15 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Mask, NodeVector, Scalar
-from mpmjax.boundary import (
-    ConstrainedNodes,
-    Impulses,
-    OwnedImpulse,
-    owners_of,
-    received_impulses,
-    taken_by_mirrors,
-)
-from mpmjax.discretisation import AbstractTransfer, Gathered
+from mpmjax.boundary import ConstrainedNodes, Impulses, OwnedImpulse, owners_of, received_impulses, taken_by_mirrors
+from mpmjax.discretisation import Gathered
 from mpmjax.potential import Image, Mirror, SurfaceImage
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping._grid_update import GridUpdate, reaction
@@ -93,9 +86,13 @@ def impulse_on_boundaries(
 
     # what symmetry planes take of the impulses on all nodes, and what reaches the folded ones
     if scene.transfer.needs_change:
+        # the share with which particles take the change of the nodes' velocity and not the velocity itself, (1, d)
+        d, dtype, velocity = scene.grid.dim, residual.dtype, scene.transfer.velocity
+        zero, slope = jnp.zeros((d, 1), dtype), jnp.zeros((d, d, 1), dtype)
+        none, all_of_it = Gathered(zero, slope, slope), Gathered(zero + 1, slope, slope)
+        share = (velocity(zero, none, all_of_it) - velocity(zero, none, none)).T
         mass = jnp.where(soft, unfolded.mass, 0)[:, None]  # a constraint takes the velocity
-        change = unfolded.velocity - unfold(new.before(nodes))
-        residual = residual + _share_of_change(scene.transfer, residual) * mass * change
+        residual = residual + share * mass * (unfolded.velocity - unfold(new.before(nodes)))
     of_planes, residual = taken_by_mirrors(residual, images)
     parts += of_planes
 
@@ -116,24 +113,15 @@ def impulse_on_boundaries(
             parts.append(OwnedImpulse(friction, number))
 
     # about where nodes and pivots are at the time of the forces
-    places, pivots, share = at, _pivots(scene, t, residual), method.force_at()
-    if scene.total:
-        places = _carried(scene, particles, t, unfolded, at, owners)
-    if share is not None:
+    places = _carried(scene, particles, t, unfolded, at, owners) if scene.total else at
+    pivots, force_at = _pivots(scene, t, residual), method.force_at()
+    if force_at is not None:
         moved = unfold(new.motion.carrier)
         for image in nodes.tied:
             moved = image.with_own(moved, image.places(new.motion.carrier))
-        places = places + share * dt * moved
-        pivots = pivots + share * (_pivots(scene, t + dt, residual) - pivots)
+        places = places + force_at * dt * moved
+        pivots = pivots + force_at * (_pivots(scene, t + dt, residual) - pivots)
     return received_impulses(parts, places, pivots, couples)
-
-
-def _share_of_change(transfer: AbstractTransfer, like: NodeVector) -> Array:
-    """The share with which particles take the change of the nodes' velocity and not the velocity itself, (1, d)."""
-    d = like.shape[1]
-    zero, slope = jnp.zeros((d, 1), like.dtype), jnp.zeros((d, d, 1), like.dtype)
-    none, whole = Gathered(zero, slope, slope), Gathered(zero + 1, slope, slope)
-    return (transfer.velocity(zero, none, whole) - transfer.velocity(zero, none, none)).T
 
 
 def _carried(scene: Scene, particles: Particles, t: Scalar, nodes: Nodes, at: NodeVector, owners: Array) -> NodeVector:

@@ -192,10 +192,9 @@ def particles_to_grid(
     C = None if particles.C is None else components(particles.C)
     joined = joined and (stencil.is_least_squares or not scene.transfer.affine)
     potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), size)
-    A, B = potential.stress_factors()  # of the flux V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
     L = C if explicit_viscosity and potential.material_viscous else None
-    if B is not None and (L is not None or not joined):
-        A, B = la.matmul(A, la.transpose(B)), None
+    # of the flux V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
+    A, B = potential.stress_factors() if joined and L is None else (potential.weighted_stress(), None)
     if L is not None:
         L = L if stencil.radius is None else in_space(stencil.radius, v, L)
         A = A + potential.weighted_viscous_stress(L)

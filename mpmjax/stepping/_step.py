@@ -200,12 +200,7 @@ def force_error(
 
 @checked
 def step(
-    scene: Scene,
-    particles: Particles,
-    t: Scalar,
-    dt: Scalar,
-    *,
-    method: AbstractIntegrator = Explicit(),
+    scene: Scene, particles: Particles, t: Scalar, dt: Scalar, *, method: AbstractIntegrator = Explicit()
 ) -> tuple[Particles, StepInfo]:
     """One step of the Material Point Method, from t to t + dt.
 

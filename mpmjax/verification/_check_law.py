@@ -18,6 +18,7 @@ _CHECKED = (
     "the derivative of the energy's gradient",
     "the energy after a rotation of space",
     "stress",
+    "kirchhoff_numbers",
     "stress_differential",
     "the derivative of stress_differential by F and the law's parameters",
     "principal_differential",
@@ -31,9 +32,9 @@ def check_law(law: AbstractLaw, *, dim: int = 3, F: Any = None, rtol: float = 1e
     The check is in float64, at each deformation that the law admits:
 
     - The energy is finite, and a rotation of space does not change it.
-    - `stress` is the gradient of the energy, `stress_differential` the derivative of that, and `principal_differential`
-      its eigenstructure, as in the defaults of `AbstractMaterial`. Differences are relative to the size of the stress
-      differential.
+    - `stress` is the gradient of the energy, `kirchhoff_numbers` give it, `stress_differential` is its derivative, and
+      `principal_differential` the eigenstructure of that, as in the defaults of `AbstractMaterial`. Differences are
+      relative to the size of the stress differential.
     - The derivatives of the stress differential by F and by the parameters of the law are finite.
 
     For a law with a history, the elastic law of its initial history is checked. For a viscous law, the law without the
@@ -104,6 +105,7 @@ def _faults(law: AbstractMaterial, F: Matrix) -> tuple[Bool[Array, "p"], tuple[F
     A = la.matrix_of(lambda dF: jax.jvp(lambda F: base.stress(law, F), (F,), (dF,))[1], F)
     stiffness = jnp.sqrt((A**2).sum(axis=(0, 1)))
     U, s, V = la.principal_frame(F)
+    tau, pair, one = la.matmul(stress, la.transpose(F)), law.kirchhoff_numbers(F), la.identity_like(F)
 
     def differential(law: AbstractMaterial, F: Matrix) -> Array:
         return la.matrix_of(law.stress_differential(F), F)
@@ -122,6 +124,7 @@ def _faults(law: AbstractMaterial, F: Matrix) -> tuple[Bool[Array, "p"], tuple[F
         0 * stiffness,
         compared(turned[None, None], energy[None, None]),
         compared(law.stress(F), stress),
+        compared(tau if pair is None else pair[0] * la.matmul(F, la.transpose(F)) + pair[1] * one, tau),
         compared(differential(law, F), A),
         0 * _size(third),
     )

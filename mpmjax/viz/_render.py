@@ -221,11 +221,8 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
     from matplotlib import pyplot as plt
     from mpl_toolkits.mplot3d import proj3d
 
-    assert run.frames is not None
-    turn = _upright(run.scene)
-    volume = _volume(run)
+    turn, volume, x = _upright(run.scene), _volume(run), _places(run)
     size = float(volume.sum() / max(np.count_nonzero(volume), 1)) ** (1 / 3)
-    x = _places(run)
     lower, upper = x.min(axis=0) - size, x.max(axis=0) + size
     extent = float((upper - lower).max())
     room, spacing = (lower - extent / 2, upper + extent / 2), max(size, extent / 50)
