@@ -221,8 +221,8 @@ void check_moves(const Example<T>& e, std::mt19937& random, const std::vector<co
     for (int64_t i = 0; i < array->size; ++i) (*array)[i] = 1 + std::abs((*array)[i]);
   }
   const Array<T> whole(sh.batch * n), means(sh.batch * n * d), sums(sh.batch * n * (d + 1));
-  for (int kind = 0; kind < 5; ++kind) {  // both terms, C alone, A Bᵀ alone, A alone, q B Bᵀ + r I alone
-    const bool affine = kind < 2, pushed = kind != 1, isotropic = kind == 4, factored = pushed && kind != 3;
+  for (int kind = 0; kind < 6; ++kind) {  // both terms, C alone, A Bᵀ alone, A alone, q B Bᵀ + r I alone, r I alone
+    const bool affine = kind < 2, pushed = kind != 1, isotropic = kind > 3, factored = pushed && kind % 2 == 0;
     for (int64_t i = 0; i < sh.batch * p; ++i) {
       const int64_t b = i / p, k = i % p;
       const auto at = [&](const Array<T>& a, int64_t rows, int64_t row) -> T& { return a[(b * rows + row) * p + k]; };
@@ -250,7 +250,7 @@ void check_moves(const Example<T>& e, std::mt19937& random, const std::vector<co
     }
     const P2G<T> task = {e.stencils(false), least.get(), slope.get(), factor.get(), mass.get(), x.get(),
                          affine ? C.get() : nullptr, pushed && !isotropic ? A.get() : nullptr,
-                         factored ? B.get() : nullptr, isotropic ? q.get() : nullptr, isotropic ? even.get() : nullptr,
+                         factored ? B.get() : nullptr, kind == 4 ? q.get() : nullptr, isotropic ? even.get() : nullptr,
                          whole.get(), means.get(), sums.get(), nullptr, nullptr, n, d + 1};
     by_all(pools, "a P2G", [&](const Pool& pool) { p2g(pool, sh.batch, task); }, whole, means);
     compare("P2G", sh, means, expected);

@@ -14,12 +14,12 @@ namespace {
 template <class T>
 void call_p2g(const Pool& pool, Call& call) {
   const bool affine = call.flag("affine"), pushed = call.flag("pushed"), factored = call.flag("factored");
-  const bool isotropic = call.flag("isotropic");
+  const bool isotropic = call.flag("isotropic"), bent = isotropic && factored;
   auto task = sum_of<P2G<T>>(call, call.operands + 2);
   call.expect(task.columns == task.stencils.basis.d + 1, "nodes of another dimension");
   const std::initializer_list<bool> present = {true, true,   false,  true,     true,      true,     true,
-                                               true, affine, pushed, factored, isotropic, isotropic};
-  const size_t operands = 7 + affine + pushed + factored + 2 * isotropic;
+                                               true, affine, pushed, factored, bent,      isotropic};
+  const size_t operands = 7 + affine + pushed + factored + bent + isotropic;
   if (call.read(task, operands, 3, present)) p2g(pool, call.batch, task);
 }
 

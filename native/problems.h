@@ -143,7 +143,7 @@ struct Average {
 
 // An average of what particles have: of v, weighted with their mass, and the gradients a_b = m C_b D_b + factor (A Bᵀ)_b
 // in spacings, with the moment D of the weights. C or A may be null, and B where it is the identity. Where there are
-// numbers q and r of each particle, q B Bᵀ + r I stands for A Bᵀ.
+// numbers q and r of each particle, q B Bᵀ + r I stands for A Bᵀ, or r I alone.
 template <class T>
 struct P2G {
   Stencils<T> stencils;

@@ -139,7 +139,7 @@ def call_p2g(
     A, q, r = (None, *A) if isinstance(A, tuple) else (A, None, None)
     operands = [stencil.first, stencil.offset, least, stencil.slope, factor, mass, v, C, A, B, q, r]
     names = "affine", "pushed", "factored", "isotropic"
-    told = dict(zip(names, (a is not None for a in operands[7:11]), strict=True))
+    told = dict(zip(names, (a is not None for a in (C, A, B, r)), strict=True))
     d = v.shape[-2]
     shapes = (size,), (size, d), (size, d + 1)  # the last one holds the sums before they are divided
     results = [jax.ShapeDtypeStruct(shape, v.dtype) for shape in shapes]

@@ -166,8 +166,8 @@ def without_empty(
 
 
 Impulse = tuple[Scalar, Any, Any]
-"""Factors c, A and B of a matrix c A Bᵀ for each particle: c A where B is None, c (q B Bᵀ + r I) where A is two
-numbers q and r of each particle."""
+"""Factors c, A and B of a matrix c A Bᵀ for each particle: c A where B is None. Where A is two
+numbers q and r of each particle, c (q B Bᵀ + r I), or c r I where q and B are None."""
 
 
 def p2g(
@@ -215,7 +215,9 @@ def p2g_sum(
     if impulse is not None:
         factor, A, B = impulse
         if isinstance(A, tuple):
-            terms.append(factor * (A[0] * la.matmul(B, la.transpose(B)) + A[1] * la.identity_like(B)))
+            q, r = A
+            bent = 0.0 if B is None else q * la.matmul(B, la.transpose(B))
+            terms.append(factor * (bent + r * jnp.eye(len(v), dtype=v.dtype)[:, :, None]))
         else:
             terms.append(factor * (A if B is None else la.matmul(A, la.transpose(B))))
     if C is not None:  # w (x_i − x_p) = D g, with g the moving-least-squares gradient

@@ -96,11 +96,13 @@ class ElasticPotential(eqx.Module):
 
     def stress_factors(self) -> tuple[Any, Matrix | None]:
         """Factors A and B of `weighted_stress` at u = 0, as `p2g` takes them: of one material V0 P, or the
-        `kirchhoff_numbers` of its law, and F."""
+        `kirchhoff_numbers` of its law, and F; of a law of J a pressure."""
         points, *others = self.material_points
-        if others or not points.strained_by_gradient or self.stencil.radius is not None:
+        if others or points.total or self.stencil.radius is not None:
             return self.weighted_stress(), None
         F = points.deformation
+        if F.ndim == 1:
+            return (None, materialised(points.volume * points.stress(F) * F)), None
         if points.average is None and (numbers := points.law.kirchhoff_numbers(F)) is not None:
             return materialised(tuple(points.volume * number for number in numbers)), F
         return materialised(points.volume * points.stress(F)), F
