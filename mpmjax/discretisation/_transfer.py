@@ -166,8 +166,8 @@ def without_empty(
 
 
 Impulse = tuple[Scalar, Any, Any]
-"""Factors c, A and B of a matrix c A Bᵀ for each particle: c A where B is None. Where A is two
-numbers q and r of each particle, c (q B Bᵀ + r I), or c r I where q and B are None."""
+"""Factors c, a number, A and B, of shape (d, d, p), of a matrix c A Bᵀ for each particle: c A where B is None. In place
+of A there may be numbers (q, r) of each particle, for c (q B Bᵀ + r I), or c r I where q and B are None."""
 
 
 def p2g(
