@@ -244,7 +244,7 @@ def test_annotations_say_what_must_hold_of_values(make, values, says):
 
 @pytest.mark.parametrize(("args", "values"), [((2.0,), {}), ((), {"shear": 2.0})])
 def test_a_call_that_does_not_fit_names_the_function_and_what_it_takes(args, values):
-    with pytest.raises(TypeError, match="^marked takes modulus, share: "):
+    with pytest.raises(TypeError, match=r"^marked takes modulus, share: "):
         marked(*args, **values)
 
 
