@@ -4,6 +4,7 @@ import abc
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, Mask, NodeVector, ParticleVector, Scalar
@@ -25,7 +26,9 @@ class AbstractLayerImage(AbstractImage):
 
     def with_own(self, field: Array, layer: Array) -> Array:
         """The field with that part replaced."""
-        return field.reshape(self.layers, *layer.shape).at[self.layer].set(layer).reshape(field.shape)
+        layers = field.reshape(self.layers, *layer.shape)
+        # not `.at[].set`: XLA's update in place has overwritten what the new part is computed from (jax 0.10.1)
+        return jnp.concatenate([layers[: self.layer], layer[None], layers[self.layer + 1 :]]).reshape(field.shape)
 
     @abc.abstractmethod
     def places(self, carrier: NodeVector) -> Float[Array, "m d"]:
