@@ -28,6 +28,7 @@ from itertools import groupby, permutations
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
@@ -344,9 +345,12 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
                 rubbed, by_contact[k] = rubbed + change, change
             by_order.append(by_contact)
         total = [reduce(jnp.add, each) / len(orders) for each in zip(*by_order, strict=True)]
-        # v has been unfolded: its changes follow the walls, and are not scaled again
-        changes = tuple(map(Mirror(self.images.images[1:]).unfold, total))
-        return sum(changes, v), changes
+        walls = self.images.images[1:]
+        if contacts and walls:
+            # v has been unfolded: its changes follow the walls, and are not scaled again. All changes in one pass: the
+            # map of a surface takes long to compile
+            total = list(jax.vmap(Mirror(walls).unfold)(jnp.stack(total)))
+        return sum(total, v), tuple(total)
 
 
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
@@ -375,10 +379,11 @@ def count_places(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:
 
 
 def friction_change(
-    projection: Any, mass: NodeScalar, normal: Array, velocity: NodeVector | Scalar, limit: NodeScalar, v: NodeVector
-) -> NodeVector:
-    """The change of velocity by friction on a surface [m/s], shape (n, d): −min(1, limit/(m ‖s‖)) s with the slip s,
-    the part of v − v_c along the surface and in directions that nothing else holds.
+    projection: Any, mass: NodeScalar, normal: Array, velocity: NodeVector | Scalar, limit: NodeScalar
+) -> Callable[[NodeVector], NodeVector]:
+    """The change of velocity by friction on a surface [m/s], shape (n, d), as a function of the velocity v of all
+    nodes: −min(1, limit/(m ‖s‖)) s with the slip s, the part of v − v_c along the surface and in directions that
+    nothing else holds.
 
     Args:
         projection: the projection on what nothing else holds, of the nodes with the active set held.
@@ -386,25 +391,28 @@ def friction_change(
         normal: a multiple of the surface's normal, of all nodes or of shape (n, d); zero where it does not push.
         velocity: velocity v_c of the surface [m/s], shape (n, d); zero at rest.
         limit: the largest impulse of friction at each node [kg m/s], shape (n,).
-        v: velocity of all nodes [m/s], shape (n, d).
     """
     square = (normal**2).sum(axis=-1, keepdims=True)
     unit = normal / jnp.sqrt(jnp.where(square == 0, 1, square))
-    free, relative, earlier = projection.free, v - velocity, []
-    slip = jnp.where(free, relative, 0)
-    # without its parts along what colliders hold and the normal; one within a hundredth of those before changes nothing
+    limit, free, across = jnp.where(square[..., 0] > 0, limit, 0), projection.free, []
+    # what colliders hold and the normal, made orthogonal; one within a hundredth of those before changes nothing
     for along in [*projection.normals, jnp.where(free, unit, 0)]:
-        for other in earlier:
+        for other in across:
             along = along - other * (other * along).sum(axis=1, keepdims=True)
         length = (along**2).sum(axis=1, keepdims=True)
         some = length > PARALLEL**2
-        along = jnp.where(some, along / jnp.sqrt(jnp.where(some, length, 1)), 0)
-        slip = slip - along * (along * slip).sum(axis=1, keepdims=True)
-        earlier.append(along)
-    # what slides along the surface as another boundary prescribes takes its part of the limit
-    whole = slip + jnp.where(free | (unit != 0), 0, relative)
-    share = friction_share(whole, mass, jnp.where(square[..., 0] > 0, limit, 0))
-    return -share[:, None] * slip
+        across.append(jnp.where(some, along / jnp.sqrt(jnp.where(some, length, 1)), 0))
+
+    def change(v: NodeVector) -> NodeVector:
+        relative = v - velocity
+        slip = jnp.where(free, relative, 0)
+        for along in across:
+            slip = slip - along * (along * slip).sum(axis=1, keepdims=True)
+        # what slides along the surface as another boundary prescribes takes its part of the limit
+        whole = slip + jnp.where(free | (unit != 0), 0, relative)
+        return -friction_share(whole, mass, limit)[:, None] * slip
+
+    return change
 
 
 def friction_share(slip: NodeVector, mass: NodeScalar, limit: NodeScalar) -> NodeScalar:

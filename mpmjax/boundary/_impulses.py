@@ -111,7 +111,7 @@ def taken_by_mirrors(field: NodeVector, images: Sequence[tuple[Any, Any]]) -> tu
     """
     taken, remaining = [], jnp.zeros_like(field)
     planes = all(isinstance(image, Image | WallImage) for _, image in images)  # they commute
-    for axis in range(field.shape[1]):
+    for axis in range(field.shape[1]) if planes else [slice(None)]:
         part = jnp.zeros_like(field).at[:, axis].set(field[:, axis])
         order = list(reversed(images))
         if planes:

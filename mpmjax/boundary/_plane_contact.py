@@ -95,7 +95,7 @@ class PlaneContact(AbstractContact):
         normal = (jnp.arange(residual.shape[1]) == self.axis).astype(limit.dtype)
         velocity = self.walls[0].velocity  # of a box both rest
         moving = jnp.zeros((), limit.dtype) if velocity is None else velocity
-        return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, moving, limit, v)
+        return friction_change(held.nodes.projection, held.nodes.mass, normal, moving, limit)
 
     def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """The normal component of nodes that follow in it alone, as on the wall."""

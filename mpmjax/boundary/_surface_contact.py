@@ -14,6 +14,7 @@ from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -210,18 +211,19 @@ class SurfaceContact(AbstractSpringContact):
     ) -> Callable[[NodeVector], NodeVector]:
         pushes, (size, d) = jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0), residual.shape
         push, mirror = pushes.sum(axis=0), held.nodes.potential.mirror
-        around = [(self.coefficient * push)[None]]
-        if self.axis is None:
-            velocity = jnp.zeros_like(self.normal) if self.velocity is None else self.velocity
-            around += [push[None], along(pushes) * self.normal, push * velocity]
-        sums = scatter(self.faces.stencil, jnp.concatenate(around), None, size)
-        limit = mirror.fold_scalar(sums[:, 0])
+        limit = self.coefficient * push
         if self.axis is not None:
-            normal = (jnp.arange(d) == self.axis).astype(limit.dtype)
-            return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, 0.0, limit, v)
-        pushed, normal = mirror.fold_scalar(sums[:, 1]), mirror.fold(sums[:, 2 : d + 2])
-        moving = mirror.fold(sums[:, d + 2 :]) / jnp.where(pushed == 0, 1, pushed)[:, None]
-        return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, moving, limit, v)
+            limit = mirror.fold_scalar(scatter(self.faces.stencil, limit[None], None, size)[:, 0])
+            normal, moving = (jnp.arange(d) == self.axis).astype(limit.dtype), 0.0
+        else:
+            velocity = jnp.zeros_like(self.normal) if self.velocity is None else self.velocity
+            around = jnp.concatenate([limit[None], push[None], along(pushes) * self.normal, push * velocity])
+            sums = scatter(self.faces.stencil, around, None, size)
+            limit, pushed = mirror.fold_scalar(sums[:, :2]).T
+            # both in one pass: each map of a surface is large to compile
+            normal, moving = jax.vmap(mirror.fold, 1)(sums[:, 2:].reshape(size, 2, d))
+            moving = moving / jnp.where(pushed == 0, 1, pushed)[:, None]
+        return friction_change(held.nodes.projection, held.nodes.mass, normal, moving, limit)
 
 
 def surface_contact(surface: Surface, faces: Faces) -> SurfaceContact:
