@@ -25,21 +25,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from itertools import groupby, permutations
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.boundary._conditions import PARALLEL, Conditions, OwnedImpulse
+from mpmjax.boundary._conditions import PARALLEL, OwnedImpulse
 from mpmjax.potential import (
     AbstractSpring,
     AbstractTerm,
     Displacement,
     Mirror,
-    SurfaceImage,
-    WallImage,
     scattered,
     with_one_mass,
 )
@@ -52,54 +50,6 @@ class ContactInfo(eqx.Module):
 
     sweeps: Int[Array, "*f"]  # solves before the last one
     violations: Int[Array, "*f"]  # places that pull or are entered all the same
-
-
-class AbstractNodes(eqx.Module):
-    """The interface of a step's nodes to contact."""
-
-    mass: eqx.AbstractVar[NodeScalar]  # m_i [kg], shape (n,)
-    conditions: eqx.AbstractVar[Conditions]  # the prescribed motion
-    dt: eqx.AbstractVar[Array]  # Δt [s]
-    potential: eqx.AbstractVar[Any]
-    """The potential Φ of the nodes' displacement, with the mirrors of symmetry planes and of columns that are held."""
-    contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]  # the boundaries that may be left
-    walls: eqx.AbstractVar[tuple[tuple[WallImage | SurfaceImage, ...], ...]]
-    """The walls of each boundary that hold what flows at all times; empty without any."""
-    brought_by: eqx.AbstractVar[tuple[int | None, ...]]
-    """The number of the boundary that brings each contact; None for that of two bodies."""
-    loose: eqx.AbstractVar[Any]  # the nodes before the constraints of bodies; None without any
-    tied: eqx.AbstractVar[tuple[Any, ...]]  # the maps of these constraints
-
-    @property
-    @abc.abstractmethod
-    def free(self) -> Mask:
-        """The components of velocity that nothing prescribes, on nodes that have mass, shape (n, d)."""
-
-    @property
-    @abc.abstractmethod
-    def free_normals(self) -> tuple[Any, ...]:
-        """The free parts of the colliders' normals."""
-
-    @property
-    @abc.abstractmethod
-    def projection(self) -> Any:
-        """The projection on the components that nothing holds."""
-
-    @abc.abstractmethod
-    def constrained(self: "N", images: Mirror, mass: NodeScalar, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "N":
-        """These nodes folded at further mirrors to these masses [kg], shape (n,), with the components `fixed` held and
-        further springs."""
-
-    @abc.abstractmethod
-    def explicit_velocity(self) -> NodeVector:
-        """v* [m/s], shape (n, d)."""
-
-    @abc.abstractmethod
-    def per_mass(self, impulse: NodeVector) -> NodeVector:
-        """An impulse or force divided by the nodes' mass; zero on empty nodes."""
-
-
-N = TypeVar("N", bound=AbstractNodes)
 
 
 class AbstractContact(eqx.Module):
@@ -115,7 +65,7 @@ class AbstractContact(eqx.Module):
     - `shape`: (n, d).
     """
 
-    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
+    def known_at_start(self, nodes: Any, explicit: bool) -> bool:
         """Whether `likely_held` is the active set of a step, whose force is that at its start if it is explicit.
         Default: it may not be."""
         return False
@@ -206,7 +156,7 @@ class AbstractSpringContact(AbstractContact):
     dt: eqx.AbstractVar[Scalar]  # Δt [s]
     share: eqx.AbstractVar[Scalar]  # θ; 1 where forces are those at the start of the step
 
-    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
+    def known_at_start(self, nodes: Any, explicit: bool) -> bool:
         return explicit
 
     @property
@@ -239,14 +189,14 @@ class AbstractSpringContact(AbstractContact):
         return noise, noise * self.stiffness * self.dt**2
 
 
-class ConstrainedNodes(eqx.Module, Generic[N]):
-    """The nodes while an active set is held; see `constrain`. In its methods `v` is the velocity of all nodes [m/s] and
-    `residual` the impulse that is missing at each [kg m/s], shape (n, d)."""
+class ConstrainedNodes(eqx.Module):
+    """The nodes while an active set is held (see `constrain`); `nodes` are `Nodes` of the stepping room. In its methods
+    `v` is the velocity of all nodes [m/s] and `residual` the impulse that is missing at each [kg m/s], shape (n, d)."""
 
-    unconstrained: N  # the nodes of which no contact holds anything
+    unconstrained: Any  # the nodes of which no contact holds anything
     active: ActiveSet  # the active set
     images: Mirror  # a scaling and the walls that hold nodes, in contact or at all times
-    nodes: N  # the nodes with the active set held
+    nodes: Any  # the nodes with the active set held
     displacement: NodeVector | None = None
     """The displacement at which forces that are linear in it have their mean over the step [m], shape (n, d), mirrored
     as velocities are; None for none, as in an explicit step."""
@@ -353,7 +303,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         return sum(total, v), tuple(total)
 
 
-def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
+def constrain(nodes: Any, active: ActiveSet) -> ConstrainedNodes:
     """The nodes with an active set held; no contact may hold anything of them yet."""
     pairs = list(zip(nodes.contacts, active, strict=True))
     # those that hold every column come last: they fill in what lies behind them in columns that contacts release
@@ -369,7 +319,7 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     return ConstrainedNodes(nodes, active, images, constrained, held_by=held_by)
 
 
-def count_places(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:
+def count_places(nodes: Any, *sets: ActiveSet) -> Int[Array, ""]:
     """How many places some sets have."""
     pairs = [
         (contact.representative(), mask) for part in sets for contact, mask in zip(nodes.contacts, part, strict=True)

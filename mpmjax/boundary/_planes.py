@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, carried_by_motion, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._plane_contact import SHUT, plane_contact
@@ -210,7 +210,7 @@ class ClampPlane(AbstractMovingPlane):
         return AbstractPlane.passed(self, start, end, spacing, t, dt, reach) if self.motion is None else None
 
     def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector:
-        return nodes if self.motion is None else nodes + self.motion.place(nodes, t) - self.motion.place(nodes, 0.0)
+        return carried_by_motion(self.motion, nodes, t)
 
     def pivot(self, t: Scalar) -> Float[Array, "d"] | None:
         """The centre of what turns."""

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, Scalar
-from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, carried_by_motion
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import Grid
@@ -56,7 +56,7 @@ class Grip(AbstractBoundary):
         return Conditions(fixed, jnp.where(fixed, self.motion.velocity_of(place, t, dt), 0))
 
     def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector:
-        return nodes + self.motion.place(nodes, t) - self.motion.place(nodes, 0.0)
+        return carried_by_motion(self.motion, nodes, t)
 
     def pivot(self, t: Scalar) -> Float[Array, "d"]:
         """The region's middle."""

@@ -135,17 +135,13 @@ class Springs(AbstractSpring):
         return jnp.stack([sign * shift - growth for sign in SIGNS[: len(self.stretch)]])
 
     def spread(self, amount: Float[Array, "s p"], size: int) -> Forces:
-        return Forces(value=along(amount) * self.normal, slopes=-amount.sum(axis=0) * self.arm[:, None] * self.normal)
+        along = amount[0] - amount[1:].sum(axis=0)  # the normal of the first surface
+        return Forces(value=along * self.normal, slopes=-amount.sum(axis=0) * self.arm[:, None] * self.normal)
 
     def diagonal(self, stencil: Stencil, size: int) -> Forces:
         """Without the products of weights and their derivatives."""
         k = self.stiffness.sum(axis=0)
         return Forces(value=k * self.normal**2, slopes=k * (self.arm[:, None] * self.normal) ** 2)
-
-
-def along(amount: Float[Array, "s p"]) -> Float[Array, "p"]:
-    """The sum of amounts along the normal of each surface, along that of the first."""
-    return amount[0] if len(amount) == 1 else amount[0] - amount[1]
 
 
 class Surface(NamedTuple):
@@ -217,7 +213,9 @@ class SurfaceContact(AbstractSpringContact):
             normal, moving = (jnp.arange(d) == self.axis).astype(limit.dtype), 0.0
         else:
             velocity = jnp.zeros_like(self.normal) if self.velocity is None else self.velocity
-            around = jnp.concatenate([limit[None], push[None], along(pushes) * self.normal, push * velocity])
+            around = jnp.concatenate(
+                [limit[None], push[None], (pushes[0] - pushes[1:].sum(axis=0)) * self.normal, push * velocity]
+            )
             sums = scatter(self.faces.stencil, around, None, size)
             limit, pushed = mirror.fold_scalar(sums[:, :2]).T
             # both in one pass: each map of a surface is large to compile
