@@ -17,7 +17,7 @@ import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, carried_by_motion
-from mpmjax.boundary._conditions import Conditions, Slide, no_conditions
+from mpmjax.boundary._conditions import Conditions, Slide, no_conditions, prescribed
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._flow_contact import FlowContact
 from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
@@ -179,8 +179,9 @@ class StickyCollider(AbstractHoldingCollider):
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = v_c."""
         place, velocity = self.seen_by(nodes, t, dt, reference)
+        velocity = None if self.motion is None else velocity
         fixed = jnp.broadcast_to(self.shape.contains(place, ON_THE_WALL * spacing)[:, None], nodes.shape)
-        return Conditions(fixed, jnp.where(fixed, velocity, 0), moves=self.motion is not None)
+        return prescribed(fixed, velocity, nodes.dtype)
 
 
 class SlipCollider(AbstractHoldingCollider):

@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 from functools import reduce
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.geometry import Motion
+from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 
 PARALLEL = 1e-2  # length of a unit normal's part in free directions up to which it is prescribed by the others
 
@@ -103,8 +103,8 @@ def no_conditions(nodes: NodeVector) -> Conditions:
     return Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes), holds=False, moves=False)
 
 
-def held_by_wall(fixed: Mask, motion: Motion | None, nodes: NodeVector, t: Scalar, dt: Scalar) -> Conditions:
-    """Components that a wall holds, shape (n, d), at rest or at the velocity of its motion."""
-    if motion is None:
-        return Conditions(fixed, jnp.zeros_like(nodes), moves=False)
-    return Conditions(fixed, jnp.where(fixed, motion.velocity(t, dt), 0))
+def prescribed(fixed: Mask, velocity: NodeVector | None, dtype: Any) -> Conditions:
+    """Components that are held, shape (n, d), at rest or with a velocity of all nodes [m/s], shape (n, d)."""
+    if velocity is None:
+        return Conditions(fixed, jnp.zeros(fixed.shape, dtype), moves=False)
+    return Conditions(fixed, jnp.where(fixed, velocity, 0))

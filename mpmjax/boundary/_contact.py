@@ -132,10 +132,6 @@ class AbstractContact(eqx.Module):
         """
         return 0.0
 
-    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """The components of velocity on which the held places act, shape (n, d). Default: those of `fixed`."""
-        return self.fixed(active, shape)
-
     def representative(self) -> Bool[Array, "n"] | None:
         """One node of each place, shape (n,), by which places are counted; None where each node is a place."""
         return None
@@ -219,10 +215,10 @@ class ConstrainedNodes(eqx.Module):
         return self.unconstrained.potential.displaced(self.displacement)
 
     def beyond_boundaries(self) -> tuple[Mask, tuple[NodeVector, ...]]:
-        """The components of velocity on which no boundary acts, shape (n, d), and the normals that colliders hold."""
+        """The components of velocity that no boundary holds, shape (n, d), and the normals that colliders hold."""
         free = self.unconstrained.free
         reached = [wall.reached(free.shape) for _, wall in self.walls]
-        reached += [c.reached(a, free.shape) for c, a in zip(self.unconstrained.contacts, self.active, strict=True)]
+        reached += [c.fixed(a, free.shape) for c, a in zip(self.unconstrained.contacts, self.active, strict=True)]
         free = reduce(lambda free, held: free & ~held, reached, free)
         return free, tuple(jnp.where(free, normal, 0) for normal in self.nodes.projection.normals)
 

@@ -187,11 +187,6 @@ class SurfaceContact(AbstractSpringContact):
     def spread(self, stretch: Array, stiffness: Array) -> Springs:
         return Springs(stretch, stiffness, self.normal, self.arm)
 
-    def reached(self, active: Array, shape: tuple[int, ...]) -> Bool[Array, "n d"]:
-        """All components of the nodes around the particles held."""
-        shut = (active & self.near).any(axis=0).astype(self.gap.dtype)
-        return jnp.broadcast_to(scatter(self.faces.stencil, shut[None], None, shape[0]) > 0, shape)
-
     @staticmethod
     def stability_rate(contacts: tuple[Any, ...], nodal_mass: NodeScalar, mass: Array, steepness: Array) -> Array:
         """n k (1 + A b²)/m, with n the largest eigenvalue of the sum of n nᵀ over the surfaces whose springs a particle
