@@ -37,7 +37,7 @@ def impulse_on_colliders(
                 parts.append(OwnedImpulse(push, number))
     moved = nodes.potential.mirror.unfold(new.motion.carrier)
     places, pivots = _places_and_pivots(scene, particles, t, unfolded, owners, method, moved)
-    on = {number: pivot for number, pivot in pivots.items() if scene.boundary[number].is_collider}
+    on = {number: pivots[number] for number, boundary in enumerate(scene.boundary) if boundary.is_collider}
     return received_impulses(parts, places, on)
 
 
