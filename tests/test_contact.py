@@ -596,7 +596,7 @@ LIMITS = jnp.asarray([0.05, 0.05, 5.0])
 
 def test_friction_on_a_wall_stops_slip_and_nothing_that_is_held():
     """−min(1, limit/(m ‖s‖)) s at a free node, at one whose x is prescribed, and at one that sticks."""
-    change = friction_change(*nodes_held(X_IS_HELD), Z, 0.0, LIMITS, V)
+    change = friction_change(*nodes_held(X_IS_HELD), Z, 0.0, LIMITS)(V)
     share = 0.05 / 2 / 0.5
     np.testing.assert_allclose(change, [[-share * 0.3, -share * 0.4, 0], [0, -share * 0.4, 0], [-0.3, -0.4, 0]])
 
@@ -604,7 +604,7 @@ def test_friction_on_a_wall_stops_slip_and_nothing_that_is_held():
 def test_friction_on_a_wall_takes_what_a_collider_holds_off_the_slip():
     """With the collider's normal oblique, along the wall, and along the wall's own."""
     normal = np.array([[0.48, 0.36, 0.8], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
-    change = np.asarray(friction_change(*nodes_held([[False] * 3] * 3, normal), Z, 0.0, LIMITS, V))
+    change = np.asarray(friction_change(*nodes_held([[False] * 3] * 3, normal), Z, 0.0, LIMITS)(V))
     along = np.array([0.8, 0.6, 0])
     slip = np.array([0.3, 0.4, 0]) - along * (along @ [0.3, 0.4, 0])
     wanted = -0.05 / 2 / np.linalg.norm(slip) * slip
@@ -616,12 +616,12 @@ def test_friction_on_a_surface_stops_slip_and_nothing_that_is_held():
     what is held."""
     up = jnp.asarray([[0.0, 0.0, 3e-3], [3.0, 0.0, 4.0], [0.0, 0.0, 3.0]])
     moving = jnp.asarray([[-0.3, 0.0, 7.0]] * 3)
-    change = friction_change(*nodes_held(X_IS_HELD), up, moving, LIMITS, V)
+    change = friction_change(*nodes_held(X_IS_HELD), up, moving, LIMITS)(V)
     share = 0.05 / 2 / np.hypot(0.6, 0.4)
     np.testing.assert_allclose(change, [[-share * 0.6, -share * 0.4, 0], [0, -0.05 / 2, 0], [-0.6, -0.4, 0]])
     # Beside a collider, whose normal is at right angles to the surface's, or oblique to it; and where it does not push.
     normal = np.array([[0.8, 0.6, 0.0], [0.48, 0.36, 0.8], [0.8, 0.6, 0.0]])
-    change = friction_change(*nodes_held([[False] * 3] * 3, normal), up.at[2].set(0), moving, LIMITS, V)
+    change = friction_change(*nodes_held([[False] * 3] * 3, normal), up.at[2].set(0), moving, LIMITS)(V)
     for k in (0, 1):
         along = np.cross(normal[k], up[k])
         slip = along * (along @ (V[k] - moving[k])) / np.linalg.norm(along)

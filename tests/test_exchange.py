@@ -104,7 +104,7 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
             return cross(place, np.asarray(impulse)).sum(axis=0)
 
         pivots = np.stack([np.asarray(m.centre) + np.asarray(m.at((n + late) * dt)) for m in motions])
-        turning = [n for n, one in enumerate(scene.boundary) if one.collider_count]
+        turning = [n for n, one in enumerate(scene.boundary) if one.is_collider]
         each = zip(step.nodes.brought_by, step.nodes.contacts, step.held.active, new.friction, strict=True)
         rub = 0
         for _, contact, active, slip in (contact for contact in each if contact[0] in turning):
@@ -113,8 +113,8 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
         holding = np.asarray(step.holding)
         friction = np.asarray(step.friction)
         push = sum(np.asarray(given.impulse) for given in step.held.along_normals(step.holding))
-        holder = np.asarray(step.nodes.conditions.colliders.holder)
-        of_colliders = np.where(holder >= 0, holding, 0) + push + rub
+        held = np.isin(step.nodes.conditions.owner, turning)
+        of_colliders = np.where(held, holding, 0) + push + rub
         of_walls = np.where(walled, np.asarray(step.reaction) + friction - of_colliders, 0)
         received = step.info.colliders
         given = -np.asarray(received.angular) - cross(pivots, np.asarray(received.impulse))

@@ -294,6 +294,18 @@ def test_guides_are_told_what_they_hold(free, turns, held, name):
     assert (np.abs(along[~forbidden]) < 1e-9 * scale).all()
 
 
+def test_a_collider_beside_guides_gets_its_own_force():
+    """As a collider and as a boundary; the guides get what else there is."""
+    scene, particles = thrown(v=(0.0, -1.0), cells=14)
+    floor = mpm.SeparatingCollider(mpm.HalfSpace((0.0, -0.155), (0.1, 1.0)), friction=0.4)
+    scene = mpm.Scene(scene.grid, mpm.Rigid(1e5, (False, True), turns=False), boundary=floor, boundary_forces=True)
+    for n in range(16):
+        particles, info = mpm.step(scene, particles, n * 1e-3, 1e-3)
+    assert info.boundaries.impulse[0, 1] < -1e-3 * float(particles.mass.sum())
+    assert_close(info.colliders.impulse, info.boundaries.impulse[:1], 1e-12)
+    assert_close(info.colliders.angular, info.boundaries.angular[:1], 1e-12)
+
+
 @pytest.mark.thorough
 def test_in_one_dimension_it_only_moves():
     """There is nothing to turn."""

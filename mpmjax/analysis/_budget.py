@@ -260,10 +260,12 @@ def _budget(
         raw = scatter(stencil, before.mass[None], None, scene.grid.size)
         weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
         body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
-        held, free = reaction(nodes, new.solved, new.elastic), nodes.projection
-        if new.constrained is not None:
-            free = Projection(*new.constrained.beyond_boundaries())
-        boundary, missed = free.combine(0, held), free.combine(held, 0)
+        reacted, free = reaction(nodes, new.solved, new.elastic), nodes.projection
+        holding, held = reacted, new.constrained
+        if held is not None:
+            free, holding = Projection(*held.beyond_boundaries()), held.without_spring_impulses(reacted)
+        missed = free.combine(holding, 0)
+        boundary = reacted - missed
 
         # viscosity: its impulse, and what it dissipates of the velocity that it resists
         assert new.elastic is not None  # P2G was asked for momentum and force apart

@@ -23,7 +23,6 @@ from mpmjax.boundary._collider import (
 from mpmjax.boundary._conditions import Conditions as Conditions, FreeNormal as FreeNormal, OwnedImpulse as OwnedImpulse
 from mpmjax.boundary._contact import (
     AbstractContact as AbstractContact,
-    AbstractNodes as AbstractNodes,
     AbstractSpringContact as AbstractSpringContact,
     ActiveSet as ActiveSet,
     ConstrainedNodes as ConstrainedNodes,
@@ -37,7 +36,6 @@ from mpmjax.boundary._impulses import (
     Impulses as Impulses,
     OwnedCouple as OwnedCouple,
     no_impulses as no_impulses,
-    owners_of as owners_of,
     received_impulses as received_impulses,
     taken_by_mirrors as taken_by_mirrors,
 )

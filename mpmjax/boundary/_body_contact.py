@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractSpringContact, ConstrainedNodes, friction_share
 from mpmjax.discretisation import Grid, Stencil
 from mpmjax.geometry import length
@@ -194,13 +194,6 @@ class BodyContact(AbstractSpringContact):
     def _stretched(self, held: ConstrainedNodes) -> Float[Array, "k m"]:
         """The gap, and the slip of the step [m], shape (1 + d, m); zero where a body is not felt."""
         return self.springs(jnp.ones(self.gap.shape, bool)).stretched(held.moved) / self.share
-
-    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """All components of the two bodies' nodes around those that are held."""
-        shut = (self.patch.total((active & self.near).astype(self.gap.dtype)) > 0) & (self.patch.weight > 0)
-        layers = np.arange(shape[0] // len(active))
-        both = jnp.asarray((layers == self.pair[0]) | (layers == self.pair[1]))
-        return jnp.broadcast_to((both[:, None] & shut).reshape(-1)[:, None], shape)
 
     @staticmethod
     def stability_rate(

@@ -21,6 +21,7 @@ from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._plane_contact import FlatWall, wall_images
 from mpmjax.boundary._surface_contact import Faces, Surface, surface_contact
 from mpmjax.discretisation import Grid, scatter
+from mpmjax.geometry import AbstractMotion
 from mpmjax.potential import Image, Mirror, MirrorPlace, SurfaceImage, Tie, WallImage
 
 ON_THE_WALL = 1e-3  # distance within which a node is on a wall, in spacings
@@ -42,8 +43,7 @@ class AbstractBoundary(eqx.Module):
     `contacts`. The rest has defaults.
     """
 
-    collider_count: ClassVar[int] = 0
-    """Number of bodies in its `Conditions.colliders`; the impulses on them are recorded."""
+    is_collider: ClassVar[bool] = False  # whether it is a rigid body, the impulse on which is recorded
     pushes: ClassVar[bool] = False  # whether it has `surfaces` that push material away
     sees_faces: ClassVar[bool] = False  # whether its `contacts` need the faces of particles though it does not push
     sticks: ClassVar[bool] = False  # whether it holds the whole velocity, and not the normal one alone
@@ -169,8 +169,8 @@ class AbstractBoundary(eqx.Module):
         return fixed, value
 
     def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector | None:
-        """Where reference nodes at these positions are at time t [m], shape (n, d), if it holds them with all of their
-        components. Default: None, that is not known."""
+        """Where components that it holds of reference nodes at these positions are at time t [m], shape (n, d).
+        Default: None, that is not known."""
         return None
 
     def pivot(self, t: Scalar) -> Float[Array, "d"] | None:
@@ -187,6 +187,11 @@ class AbstractBoundary(eqx.Module):
         """Whether it acts on the same nodes at all times and is meant to act on some, so that it is an oversight if it
         touches none. Default: False. It is asked only while numbers are known."""
         return False
+
+
+def carried_by_motion(motion: AbstractMotion | None, nodes: NodeVector, t: Scalar) -> NodeVector:
+    """Where nodes that have moved with a body are at time t [m], shape (n, d)."""
+    return nodes if motion is None else nodes + motion.place(nodes, t) - motion.place(nodes, 0.0)
 
 
 def crossed(
@@ -213,19 +218,22 @@ def combined_conditions(
     them, normals of several colliders: all hold (see `Nodes.free_normals`). A normal that lies within a hundredth of
     the prescribed components and of earlier normals asks for nothing more.
     """
-    total = no_conditions(nodes)
-    for boundary in boundaries:
+    total, owner = no_conditions(nodes), jnp.full(nodes.shape, -1, jnp.int32)
+    for number, boundary in enumerate(boundaries):
         new = boundary.conditions(nodes, spacing, t, dt, reference=reference)
-        velocity, colliders = jnp.where(total.fixed, total.velocity, new.velocity), total.colliders
-        if new.colliders is not None:
-            later = replace(new.colliders, holder=jnp.where(total.fixed, -1, new.colliders.holder))
-            colliders = later if colliders is None else colliders.beside(later)
-        either = total.holds or new.holds, total.moves or new.moves
-        total = Conditions(total.fixed | new.fixed, velocity, colliders, *either)
+        owner = jnp.where(new.fixed & ~total.fixed, number, owner)
+        total = Conditions(
+            fixed=total.fixed | new.fixed,
+            velocity=jnp.where(total.fixed, total.velocity, new.velocity),
+            slides=total.slides + tuple(replace(slide, number=number) for slide in new.slides),
+            holds=total.holds or new.holds,
+            moves=total.moves or new.moves,
+        )
     for boundary in boundaries:
+        owner = boundary.extend_to_body(total.fixed, owner, nodes, spacing)[1]
         fixed, velocity = boundary.extend_to_body(total.fixed, total.velocity, nodes, spacing)
         total = replace(total, fixed=fixed, velocity=velocity)
-    return total
+    return replace(total, owner=owner)
 
 
 def mirror(

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
-from mpmjax.boundary._conditions import ColliderConditions, Conditions, Slide, no_conditions
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, carried_by_motion
+from mpmjax.boundary._conditions import Conditions, Slide, no_conditions, prescribed
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._flow_contact import FlowContact
 from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
@@ -39,7 +39,7 @@ class AbstractCollider(AbstractBoundary):
     """The body before its motion."""
     motion: eqx.AbstractVar[AbstractMotion | None]
     """How it moves; None for not at all."""
-    collider_count: ClassVar[int] = 1
+    is_collider: ClassVar[bool] = True
 
     def __check_init__(self):
         require_fields(self)
@@ -64,6 +64,9 @@ class AbstractCollider(AbstractBoundary):
         """The centre of the rotation or, without one, the shape's middle."""
         middle = jnp.asarray(self.shape.middle())
         return middle if self.motion is None else self.motion.pivot(middle, t)
+
+    def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector:
+        return carried_by_motion(self.motion, nodes, t)
 
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         bounds = self.shape.bounds()
@@ -94,23 +97,11 @@ class AbstractCollider(AbstractBoundary):
         fast = jnp.any(sum(way[:, a] ** 2 for a in range(self.dim)) > spacing**2)
         return jax.lax.cond(fast, look, lambda: jnp.zeros(len(end), bool))
 
-    def seen_by(
-        self, nodes: NodeVector, t: Scalar, dt: Scalar, reference: bool
-    ) -> tuple[ColliderConditions, NodeVector, NodeVector]:
-        """The conditions of a body that holds no node yet; the nodes in the shape's own frame [m] and the velocity of
-        the body at them [m/s], both of shape (n, d)."""
+    def seen_by(self, nodes: NodeVector, t: Scalar, dt: Scalar, reference: bool) -> tuple[NodeVector, NodeVector]:
+        """The nodes in the shape's own frame [m] and the velocity of the body at them [m/s], both of shape (n, d)."""
         motion = self.moved_by(nodes.dtype)
         place = nodes if reference else motion.origin(nodes, t)
-        middle = jnp.asarray(self.shape.middle(), nodes.dtype)
-        pivot, later = motion.pivot(middle, t), motion.pivot(middle, t + dt)
-        conditions = ColliderConditions(
-            slides=(),
-            holder=jnp.full(nodes.shape, -1, jnp.int32),
-            position=nodes + motion.place(nodes, t) - motion.place(nodes, 0.0) if reference else nodes,
-            pivots=pivot[None],
-            pivot_velocity=(later - pivot)[None] / dt,
-        )
-        return conditions, place, motion.velocity_of(place, t, dt)
+        return place, motion.velocity_of(place, t, dt)
 
     def sloped(self, place: Float[Array, "m d"], t: Scalar) -> tuple[Float[Array, "m"], Float[Array, "m d"]]:
         """The distance of points in the shape's own frame [m], and the body's unit normal there at time t: infinite and
@@ -187,10 +178,10 @@ class StickyCollider(AbstractHoldingCollider):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = v_c."""
-        nothing, place, velocity = self.seen_by(nodes, t, dt, reference)
+        place, velocity = self.seen_by(nodes, t, dt, reference)
+        velocity = None if self.motion is None else velocity
         fixed = jnp.broadcast_to(self.shape.contains(place, ON_THE_WALL * spacing)[:, None], nodes.shape)
-        touched = replace(nothing, holder=jnp.where(fixed, 0, -1).astype(jnp.int32))
-        return Conditions(fixed, jnp.where(fixed, velocity, 0), touched, moves=self.motion is not None)
+        return prescribed(fixed, velocity, nodes.dtype)
 
 
 class SlipCollider(AbstractHoldingCollider):
@@ -219,11 +210,11 @@ class SlipCollider(AbstractHoldingCollider):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = v_c·n, but at nodes where the distance has no slope, as a sampled one may have none."""
-        nothing, place, velocity = self.seen_by(nodes, t, dt, reference)
+        place, velocity = self.seen_by(nodes, t, dt, reference)
         _, normal = self.sloped(place, t + dt / 2)
         held = self.shape.contains(place, ON_THE_WALL * spacing)[:, None]
-        touched = replace(nothing, slides=(Slide(jnp.where(held, normal, 0), jnp.where(held, velocity, 0)),))
-        return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
+        slide = Slide(jnp.where(held, normal, 0), jnp.where(held, velocity, 0))
+        return replace(no_conditions(nodes), slides=(slide,), holds=True, moves=self.motion is not None)
 
 
 class SeparatingCollider(AbstractCollider):
@@ -255,9 +246,8 @@ class SeparatingCollider(AbstractCollider):
     pushes: ClassVar[bool] = True
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """None on nodes: it acts on faces. Its pivot, for torques."""
-        touched, _, _ = self.seen_by(nodes, t, dt, reference)
-        return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
+        """None on nodes: it acts on faces."""
+        return no_conditions(nodes)
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         motion = self.moved_by(x.dtype)

@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 from functools import reduce
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.geometry import Motion
+from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 
 PARALLEL = 1e-2  # length of a unit normal's part in free directions up to which it is prescribed by the others
 
@@ -26,47 +26,14 @@ class Slide(eqx.Module):
 
     normal: NodeVector  # unit normal out of it, shape (n, d); zero at nodes that it does not hold
     velocity: NodeVector  # velocity of the collider at the nodes [m/s], shape (n, d)
-    number: int = eqx.field(static=True, default=0)  # number of the collider among all colliders
-
-
-class ColliderConditions(eqx.Module):
-    """The conditions of k colliders on the nodes that lie in them."""
-
-    slides: tuple[Slide, ...]  # the colliders that hold nodes along their normal alone, in the scene's order
-    holder: Int[Array, "n d"]  # number of the collider that prescribes each component, −1 for none, shape (n, d)
-    position: NodeVector
-    """Where the nodes are [m], shape (n, d): in the total description those that are held have moved with the body."""
-    pivots: Float[Array, "k d"]  # the points about which the colliders' torques are taken [m], shape (k, d)
-    pivot_velocity: Float[Array, "k d"]  # their velocity [m/s], shape (k, d)
-
-    @property
-    def touched(self) -> Bool[Array, "n"]:
-        """The nodes of which any component is held, shape (n,)."""
-        return reduce(
-            jnp.logical_or, (slide.normal.any(axis=1) for slide in self.slides), (self.holder >= 0).any(axis=1)
-        )
-
-    def beside(self, later: "ColliderConditions") -> "ColliderConditions":
-        """These conditions and those of colliders that stand later in the scene."""
-        number = len(self.pivots)
-
-        def numbered(n: Array) -> Array:
-            return jnp.where(n < 0, n, n + number)
-
-        return ColliderConditions(
-            slides=self.slides + tuple(replace(slide, number=slide.number + number) for slide in later.slides),
-            holder=jnp.where(self.holder >= 0, self.holder, numbered(later.holder)),
-            position=jnp.where(self.touched[:, None], self.position, later.position),
-            pivots=jnp.concatenate([self.pivots, later.pivots]),
-            pivot_velocity=jnp.concatenate([self.pivot_velocity, later.pivot_velocity]),
-        )
+    number: int = eqx.field(static=True, default=0)  # number of the boundary that it is
 
 
 class FreeNormal(eqx.Module):
     """A collider's normal at each node, and its part in free components at right angles to those of earlier ones."""
 
     normal: NodeVector  # the collider's unit normal, shape (n, d)
-    owner: Int[Array, "n"]  # the collider's number, shape (n,); −1 where there is no such part
+    owner: Int[Array, "n"]  # the collider's number among the boundaries, shape (n,); −1 where there is no such part
     direction: NodeVector  # unit vector along that part, shape (n, d); zero where there is none
     length: NodeScalar  # length of that part [-], shape (n,); 1 where there is none
     speed: NodeScalar  # velocity along it [m/s], shape (n,), at which the whole normal velocity is that of the collider
@@ -81,11 +48,18 @@ class Conditions(eqx.Module):
 
     fixed: Mask  # components of velocity that are prescribed, shape (n, d)
     velocity: NodeVector  # their values [m/s], shape (n, d); zero elsewhere
-    colliders: ColliderConditions | None = None  # conditions of colliders; None without any
+    slides: tuple[Slide, ...] = ()  # the colliders that hold nodes along their normal alone, in the scene's order
+    owner: Int[Array, "n d"] | None = None
+    """The number of the boundary that prescribes each component, −1 for none; None of one boundary by itself."""
     holds: bool = eqx.field(static=True, default=True)
     """Whether any component may be held. What is known here costs a step nothing where the answer is no."""
     moves: bool = eqx.field(static=True, default=True)
     """Whether one may be held at another velocity than zero, by a collider too."""
+
+    @property
+    def touched(self) -> Bool[Array, "n"]:
+        """The nodes of which any component is held, shape (n,)."""
+        return reduce(jnp.logical_or, (slide.normal.any(axis=1) for slide in self.slides), self.fixed.any(axis=1))
 
     def free_normals(self, free: Mask) -> tuple[FreeNormal, ...]:
         """The parts of the colliders' normals in free components, made orthogonal in the colliders' order, as many as a
@@ -97,7 +71,7 @@ class Conditions(eqx.Module):
             free: the components that nothing prescribes, shape (n, d).
         """
         parts: list[FreeNormal] = []
-        for slide in () if self.colliders is None else self.colliders.slides:
+        for slide in self.slides:
             part = jnp.where(free, slide.normal, 0)
             missing = (slide.normal * (slide.velocity - jnp.where(free, 0, self.velocity))).sum(axis=1)
             for other in parts:
@@ -129,8 +103,8 @@ def no_conditions(nodes: NodeVector) -> Conditions:
     return Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes), holds=False, moves=False)
 
 
-def held_by_wall(fixed: Mask, motion: Motion | None, nodes: NodeVector, t: Scalar, dt: Scalar) -> Conditions:
-    """Components that a wall holds, shape (n, d), at rest or at the velocity of its motion."""
-    if motion is None:
-        return Conditions(fixed, jnp.zeros_like(nodes), moves=False)
-    return Conditions(fixed, jnp.where(fixed, motion.velocity(t, dt), 0))
+def prescribed(fixed: Mask, velocity: NodeVector | None, dtype: Any) -> Conditions:
+    """Components that are held, shape (n, d), at rest or with a velocity of all nodes [m/s], shape (n, d)."""
+    if velocity is None:
+        return Conditions(fixed, jnp.zeros(fixed.shape, dtype), moves=False)
+    return Conditions(fixed, jnp.where(fixed, velocity, 0))

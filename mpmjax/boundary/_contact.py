@@ -25,20 +25,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from itertools import groupby, permutations
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.boundary._conditions import PARALLEL, Conditions, OwnedImpulse
+from mpmjax.boundary._conditions import PARALLEL, OwnedImpulse
 from mpmjax.potential import (
     AbstractSpring,
     AbstractTerm,
     Displacement,
     Mirror,
-    SurfaceImage,
-    WallImage,
     scattered,
     with_one_mass,
 )
@@ -51,54 +50,6 @@ class ContactInfo(eqx.Module):
 
     sweeps: Int[Array, "*f"]  # solves before the last one
     violations: Int[Array, "*f"]  # places that pull or are entered all the same
-
-
-class AbstractNodes(eqx.Module):
-    """The interface of a step's nodes to contact."""
-
-    mass: eqx.AbstractVar[NodeScalar]  # m_i [kg], shape (n,)
-    conditions: eqx.AbstractVar[Conditions]  # the prescribed motion
-    dt: eqx.AbstractVar[Array]  # Δt [s]
-    potential: eqx.AbstractVar[Any]
-    """The potential Φ of the nodes' displacement, with the mirrors of symmetry planes and of columns that are held."""
-    contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]  # the boundaries that may be left
-    walls: eqx.AbstractVar[tuple[tuple[WallImage | SurfaceImage, ...], ...]]
-    """The walls of each boundary that hold what flows at all times; empty without any."""
-    brought_by: eqx.AbstractVar[tuple[int | None, ...]]
-    """The number of the boundary that brings each contact; None for that of two bodies."""
-    loose: eqx.AbstractVar[Any]  # the nodes before the constraints of bodies; None without any
-    tied: eqx.AbstractVar[tuple[Any, ...]]  # the maps of these constraints
-
-    @property
-    @abc.abstractmethod
-    def free(self) -> Mask:
-        """The components of velocity that nothing prescribes, on nodes that have mass, shape (n, d)."""
-
-    @property
-    @abc.abstractmethod
-    def free_normals(self) -> tuple[Any, ...]:
-        """The free parts of the colliders' normals."""
-
-    @property
-    @abc.abstractmethod
-    def projection(self) -> Any:
-        """The projection on the components that nothing holds."""
-
-    @abc.abstractmethod
-    def constrained(self: "N", images: Mirror, mass: NodeScalar, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "N":
-        """These nodes folded at further mirrors to these masses [kg], shape (n,), with the components `fixed` held and
-        further springs."""
-
-    @abc.abstractmethod
-    def explicit_velocity(self) -> NodeVector:
-        """v* [m/s], shape (n, d)."""
-
-    @abc.abstractmethod
-    def per_mass(self, impulse: NodeVector) -> NodeVector:
-        """An impulse or force divided by the nodes' mass; zero on empty nodes."""
-
-
-N = TypeVar("N", bound=AbstractNodes)
 
 
 class AbstractContact(eqx.Module):
@@ -114,7 +65,7 @@ class AbstractContact(eqx.Module):
     - `shape`: (n, d).
     """
 
-    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
+    def known_at_start(self, nodes: Any, explicit: bool) -> bool:
         """Whether `likely_held` is the active set of a step, whose force is that at its start if it is explicit.
         Default: it may not be."""
         return False
@@ -181,10 +132,6 @@ class AbstractContact(eqx.Module):
         """
         return 0.0
 
-    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """The components of velocity on which the held places act, shape (n, d). Default: those of `fixed`."""
-        return self.fixed(active, shape)
-
     def representative(self) -> Bool[Array, "n"] | None:
         """One node of each place, shape (n,), by which places are counted; None where each node is a place."""
         return None
@@ -205,7 +152,7 @@ class AbstractSpringContact(AbstractContact):
     dt: eqx.AbstractVar[Scalar]  # Δt [s]
     share: eqx.AbstractVar[Scalar]  # θ; 1 where forces are those at the start of the step
 
-    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
+    def known_at_start(self, nodes: Any, explicit: bool) -> bool:
         return explicit
 
     @property
@@ -238,14 +185,14 @@ class AbstractSpringContact(AbstractContact):
         return noise, noise * self.stiffness * self.dt**2
 
 
-class ConstrainedNodes(eqx.Module, Generic[N]):
-    """The nodes while an active set is held; see `constrain`. In its methods `v` is the velocity of all nodes [m/s] and
-    `residual` the impulse that is missing at each [kg m/s], shape (n, d)."""
+class ConstrainedNodes(eqx.Module):
+    """The nodes while an active set is held (see `constrain`); `nodes` are `Nodes` of the stepping room. In its methods
+    `v` is the velocity of all nodes [m/s] and `residual` the impulse that is missing at each [kg m/s], shape (n, d)."""
 
-    unconstrained: N  # the nodes of which no contact holds anything
+    unconstrained: Any  # the nodes of which no contact holds anything
     active: ActiveSet  # the active set
     images: Mirror  # a scaling and the walls that hold nodes, in contact or at all times
-    nodes: N  # the nodes with the active set held
+    nodes: Any  # the nodes with the active set held
     displacement: NodeVector | None = None
     """The displacement at which forces that are linear in it have their mean over the step [m], shape (n, d), mirrored
     as velocities are; None for none, as in an explicit step."""
@@ -268,10 +215,10 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         return self.unconstrained.potential.displaced(self.displacement)
 
     def beyond_boundaries(self) -> tuple[Mask, tuple[NodeVector, ...]]:
-        """The components of velocity on which no boundary acts, shape (n, d), and the normals that colliders hold."""
+        """The components of velocity that no boundary holds, shape (n, d), and the normals that colliders hold."""
         free = self.unconstrained.free
         reached = [wall.reached(free.shape) for _, wall in self.walls]
-        reached += [c.reached(a, free.shape) for c, a in zip(self.unconstrained.contacts, self.active, strict=True)]
+        reached += [c.fixed(a, free.shape) for c, a in zip(self.unconstrained.contacts, self.active, strict=True)]
         free = reduce(lambda free, held: free & ~held, reached, free)
         return free, tuple(jnp.where(free, normal, 0) for normal in self.nodes.projection.normals)
 
@@ -344,12 +291,15 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
                 rubbed, by_contact[k] = rubbed + change, change
             by_order.append(by_contact)
         total = [reduce(jnp.add, each) / len(orders) for each in zip(*by_order, strict=True)]
-        # v has been unfolded: its changes follow the walls, and are not scaled again
-        changes = tuple(map(Mirror(self.images.images[1:]).unfold, total))
-        return sum(changes, v), changes
+        walls = self.images.images[1:]
+        if contacts and walls:
+            # v has been unfolded: its changes follow the walls, and are not scaled again. All changes in one pass: the
+            # map of a surface takes long to compile
+            total = list(jax.vmap(Mirror(walls).unfold)(jnp.stack(total)))
+        return sum(total, v), tuple(total)
 
 
-def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
+def constrain(nodes: Any, active: ActiveSet) -> ConstrainedNodes:
     """The nodes with an active set held; no contact may hold anything of them yet."""
     pairs = list(zip(nodes.contacts, active, strict=True))
     # those that hold every column come last: they fill in what lies behind them in columns that contacts release
@@ -365,7 +315,7 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     return ConstrainedNodes(nodes, active, images, constrained, held_by=held_by)
 
 
-def count_places(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:
+def count_places(nodes: Any, *sets: ActiveSet) -> Int[Array, ""]:
     """How many places some sets have."""
     pairs = [
         (contact.representative(), mask) for part in sets for contact, mask in zip(nodes.contacts, part, strict=True)
@@ -375,10 +325,11 @@ def count_places(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:
 
 
 def friction_change(
-    projection: Any, mass: NodeScalar, normal: Array, velocity: NodeVector | Scalar, limit: NodeScalar, v: NodeVector
-) -> NodeVector:
-    """The change of velocity by friction on a surface [m/s], shape (n, d): −min(1, limit/(m ‖s‖)) s with the slip s,
-    the part of v − v_c along the surface and in directions that nothing else holds.
+    projection: Any, mass: NodeScalar, normal: Array, velocity: NodeVector | Scalar, limit: NodeScalar
+) -> Callable[[NodeVector], NodeVector]:
+    """The change of velocity by friction on a surface [m/s], shape (n, d), as a function of the velocity v of all
+    nodes: −min(1, limit/(m ‖s‖)) s with the slip s, the part of v − v_c along the surface and in directions that
+    nothing else holds.
 
     Args:
         projection: the projection on what nothing else holds, of the nodes with the active set held.
@@ -386,25 +337,28 @@ def friction_change(
         normal: a multiple of the surface's normal, of all nodes or of shape (n, d); zero where it does not push.
         velocity: velocity v_c of the surface [m/s], shape (n, d); zero at rest.
         limit: the largest impulse of friction at each node [kg m/s], shape (n,).
-        v: velocity of all nodes [m/s], shape (n, d).
     """
     square = (normal**2).sum(axis=-1, keepdims=True)
     unit = normal / jnp.sqrt(jnp.where(square == 0, 1, square))
-    free, relative, earlier = projection.free, v - velocity, []
-    slip = jnp.where(free, relative, 0)
-    # without its parts along what colliders hold and the normal; one within a hundredth of those before changes nothing
+    limit, free, across = jnp.where(square[..., 0] > 0, limit, 0), projection.free, []
+    # what colliders hold and the normal, made orthogonal; one within a hundredth of those before changes nothing
     for along in [*projection.normals, jnp.where(free, unit, 0)]:
-        for other in earlier:
+        for other in across:
             along = along - other * (other * along).sum(axis=1, keepdims=True)
         length = (along**2).sum(axis=1, keepdims=True)
         some = length > PARALLEL**2
-        along = jnp.where(some, along / jnp.sqrt(jnp.where(some, length, 1)), 0)
-        slip = slip - along * (along * slip).sum(axis=1, keepdims=True)
-        earlier.append(along)
-    # what slides along the surface as another boundary prescribes takes its part of the limit
-    whole = slip + jnp.where(free | (unit != 0), 0, relative)
-    share = friction_share(whole, mass, jnp.where(square[..., 0] > 0, limit, 0))
-    return -share[:, None] * slip
+        across.append(jnp.where(some, along / jnp.sqrt(jnp.where(some, length, 1)), 0))
+
+    def change(v: NodeVector) -> NodeVector:
+        relative = v - velocity
+        slip = jnp.where(free, relative, 0)
+        for along in across:
+            slip = slip - along * (along * slip).sum(axis=1, keepdims=True)
+        # what slides along the surface as another boundary prescribes takes its part of the limit
+        whole = slip + jnp.where(free | (unit != 0), 0, relative)
+        return -friction_share(whole, mass, limit)[:, None] * slip
+
+    return change
 
 
 def friction_share(slip: NodeVector, mass: NodeScalar, limit: NodeScalar) -> NodeScalar:

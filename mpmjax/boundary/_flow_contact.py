@@ -59,4 +59,4 @@ class FlowContact(AbstractContact):
         limit = self.coefficient * jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0)
         moving = 0.0 if self.image.velocity is None else self.image.velocity
         nodes = held.nodes
-        return lambda v: friction_change(nodes.projection, nodes.mass, self.image.normal, moving, limit, v)
+        return friction_change(nodes.projection, nodes.mass, self.image.normal, moving, limit)

@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Int, NodeVector, Scalar
-from mpmjax.boundary._boundary import AbstractBoundary
+from mpmjax._types import Array, Float, Int, NodeVector
 from mpmjax.boundary._conditions import OwnedImpulse
 from mpmjax.geometry import moment
 from mpmjax.linalg import pairs
@@ -61,11 +60,11 @@ class OwnedCouple(eqx.Module):
 def received_impulses(
     parts: Sequence[OwnedImpulse],
     positions: NodeVector,
-    pivots: Float[Array, "k d"],
+    pivots: dict[int, Float[Array, "d"]],
     couples: Sequence[OwnedCouple] = (),
 ) -> Impulses:
-    """The impulse on each collider or boundary, minus the parts that it gives the nodes and the couples that it gives
-    bodies, from the positions of the nodes and the points for torques [m]."""
+    """The impulse on some boundaries, minus the parts that each gives the nodes and the couples that it gives bodies,
+    from the positions of the nodes and, by the boundaries' numbers, the points for torques [m]."""
 
     def on(number: int, pivot: Array) -> tuple[Array, Array]:
         total = jnp.zeros_like(positions)
@@ -78,28 +77,8 @@ def received_impulses(
         angular = sum((jnp.where(couple.owner == number, couple.moment, 0) for couple in couples), angular)
         return -total.sum(axis=0), -angular
 
-    each = [on(number, pivot) for number, pivot in enumerate(pivots)]
+    each = [on(number, pivot) for number, pivot in pivots.items()]
     return Impulses(jnp.stack([linear for linear, _ in each]), jnp.stack([angular for _, angular in each]))
-
-
-def owners_of(
-    boundaries: tuple[AbstractBoundary, ...],
-    nodes: NodeVector,
-    spacing: Scalar,
-    t: Scalar,
-    dt: Scalar,
-    *,
-    reference: bool,
-) -> Int[Array, "n d"]:
-    """The number of the boundary that prescribes each component of the nodes' velocity, −1 for none, by the rule of
-    `combined_conditions`: the earlier one holds."""
-    owners = jnp.full(nodes.shape, -1, jnp.int32)
-    for number, boundary in enumerate(boundaries):
-        fixed = boundary.conditions(nodes, spacing, t, dt, reference=reference).fixed
-        owners = jnp.where((owners < 0) & fixed, number, owners)
-    for boundary in boundaries:
-        owners = boundary.extend_to_body(owners >= 0, owners, nodes, spacing)[1]
-    return owners
 
 
 def taken_by_mirrors(field: NodeVector, images: Sequence[tuple[Any, Any]]) -> tuple[list[OwnedImpulse], NodeVector]:
@@ -111,7 +90,7 @@ def taken_by_mirrors(field: NodeVector, images: Sequence[tuple[Any, Any]]) -> tu
     """
     taken, remaining = [], jnp.zeros_like(field)
     planes = all(isinstance(image, Image | WallImage) for _, image in images)  # they commute
-    for axis in range(field.shape[1]):
+    for axis in range(field.shape[1]) if planes else [slice(None)]:
         part = jnp.zeros_like(field).at[:, axis].set(field[:, axis])
         order = list(reversed(images))
         if planes:

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.boundary._contact import AbstractContact, AbstractNodes, ConstrainedNodes, N, friction_change
+from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes, friction_change
 from mpmjax.boundary._surface_contact import Faces
 from mpmjax.discretisation import Grid
 from mpmjax.potential import Image, SurfaceImage, WallImage, wall_image
@@ -47,7 +47,7 @@ class PlaneContact(AbstractContact):
         """Direction of the normals."""
         return self.walls[0].axis
 
-    def known_at_start(self, nodes: AbstractNodes, explicit: bool) -> bool:
+    def known_at_start(self, nodes: Any, explicit: bool) -> bool:
         """In explicit steps, where nothing across another axis and no other boundary moves the nodes of a column."""
         alone = all(wall.axis == self.axis for wall in walls_of(nodes)) and not nodes.potential.mirror.images
         return explicit and alone and not nodes.conditions.holds
@@ -95,7 +95,7 @@ class PlaneContact(AbstractContact):
         normal = (jnp.arange(residual.shape[1]) == self.axis).astype(limit.dtype)
         velocity = self.walls[0].velocity  # of a box both rest
         moving = jnp.zeros((), limit.dtype) if velocity is None else velocity
-        return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, moving, limit, v)
+        return friction_change(held.nodes.projection, held.nodes.mass, normal, moving, limit)
 
     def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """The normal component of nodes that follow in it alone, as on the wall."""
@@ -114,14 +114,14 @@ class PlaneContact(AbstractContact):
         return columns
 
 
-def walls_of(nodes: AbstractNodes) -> list[WallImage]:
+def walls_of(nodes: Any) -> list[WallImage]:
     """The walls across axes, of contacts and those that are never left."""
     planes = (contact for contact in nodes.contacts if isinstance(contact, PlaneContact))
     each = chain.from_iterable((*nodes.walls, *(plane.walls for plane in planes)))
     return [wall for wall in each if isinstance(wall, WallImage)]
 
 
-def with_tied_columns(nodes: N) -> N:
+def with_tied_columns(nodes: Any) -> Any:
     """The nodes whose walls that are never left hold the columns too that other walls tie to theirs: else what these
     move would be left behind."""
 

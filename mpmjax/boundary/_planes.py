@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
-from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, carried_by_motion, crossed
+from mpmjax.boundary._conditions import Conditions, no_conditions, prescribed
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._plane_contact import SHUT, plane_contact
 from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
@@ -27,6 +27,7 @@ class AbstractPlane(AbstractBoundary):
     axis: eqx.AbstractVar[int]  # direction of the normal, 0 to d − 1
     position: eqx.AbstractVar[Scalar]  # coordinate of the plane [m]
     keep: eqx.AbstractVar[str]  # which side holds the material: "above" or "below" the plane
+    motion: eqx.AbstractVar[Any]  # how it moves; None for not at all
     plain_box: ClassVar[str]  # the box that is the same wall anywhere, to first order
 
     def __check_init__(self):
@@ -38,7 +39,7 @@ class AbstractPlane(AbstractBoundary):
 
     @property
     def dim(self) -> int | None:
-        return None
+        return None if self.motion is None else self.motion.dim
 
     def displacement(self, t: Scalar) -> Scalar:
         """How far the plane has moved along its axis at time t [m]. Default: it does not move."""
@@ -80,22 +81,6 @@ class AbstractPlane(AbstractBoundary):
         return crossed(*coordinates, place, place - spacing / 2, spacing)
 
     def mirror(self) -> MirrorPlace:
-        return MirrorPlace(self.axis, self.position, None)
-
-    def walls(self) -> tuple[Wall, ...]:
-        return (Wall(self.axis, float(self.position), self.inward, mirrored=True),)
-
-
-class AbstractMovingPlane(AbstractPlane):
-    """A plane that may move."""
-
-    motion: eqx.AbstractVar[Any]  # how it moves; None for not at all
-
-    @property
-    def dim(self) -> int | None:
-        return None if self.motion is None else self.motion.dim
-
-    def mirror(self) -> MirrorPlace:
         return MirrorPlace(self.axis, self.position, self.motion)
 
     def walls(self) -> tuple[Wall, ...]:
@@ -103,7 +88,7 @@ class AbstractMovingPlane(AbstractPlane):
         return (Wall(self.axis, float(self.position), self.inward, mirrored=self.motion is None),)
 
 
-class SymmetryPlane(AbstractMovingPlane):
+class SymmetryPlane(AbstractPlane):
     """A plane of mirror symmetry: nodes beyond it are mirror images. It is also a frictionless wall that
     material cannot leave.
 
@@ -138,7 +123,7 @@ class SymmetryPlane(AbstractMovingPlane):
         at = self.position if reference or self.motion is None else self.position + self.displacement(t)
         on = jnp.abs(nodes[:, self.axis] - at) <= ON_THE_WALL * spacing
         fixed = jnp.zeros(nodes.shape, dtype=bool).at[:, self.axis].set(on)
-        return held_by_wall(fixed, self.motion, nodes, t, dt)
+        return prescribed(fixed, self.motion and self.motion.velocity_of(nodes, t, dt), nodes.dtype)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """A window cannot follow the material and a plane."""
@@ -154,7 +139,7 @@ class SymmetryPlane(AbstractMovingPlane):
         return (replace(mirror_image(self.axis, self.position, self.keep, grid, window), velocity=velocity),)
 
 
-class ClampPlane(AbstractMovingPlane):
+class ClampPlane(AbstractPlane):
     """A plane to which the body's face is fixed: a grip that holds at its surface.
 
     Nodes beyond it have the opposite of their image's velocity, so that the spline vanishes on the plane: second order
@@ -190,10 +175,8 @@ class ClampPlane(AbstractMovingPlane):
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = V on the plane's own nodes."""
         on = jnp.abs(nodes[:, self.axis] - self.position) <= ON_THE_WALL * spacing
-        fixed = jnp.broadcast_to(on[:, None], nodes.shape)
-        if self.motion is None:
-            return Conditions(fixed, jnp.zeros_like(nodes), moves=False)
-        return Conditions(fixed, jnp.where(fixed, self.motion.velocity_of(nodes, t, dt), 0))
+        velocity = None if self.motion is None else self.motion.velocity_of(nodes, t, dt)
+        return prescribed(jnp.broadcast_to(on[:, None], nodes.shape), velocity, nodes.dtype)
 
     def mirror_images(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> tuple[Image, ...]:
         """The image in which all components are odd, in all columns."""
@@ -210,7 +193,7 @@ class ClampPlane(AbstractMovingPlane):
         return AbstractPlane.passed(self, start, end, spacing, t, dt, reach) if self.motion is None else None
 
     def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector:
-        return nodes if self.motion is None else nodes + self.motion.place(nodes, t) - self.motion.place(nodes, 0.0)
+        return carried_by_motion(self.motion, nodes, t)
 
     def pivot(self, t: Scalar) -> Float[Array, "d"] | None:
         """The centre of what turns."""
@@ -250,6 +233,7 @@ class ContactPlane(AbstractPlane):
     position: Scalar
     keep: str = eqx.field(static=True, default="above")
     friction: Annotated[Scalar, between(0, 1e6)] = 0.0
+    motion: ClassVar[None] = None  # pyright: ignore[reportIncompatibleVariableOverride]
     plain_box: ClassVar[str] = "SeparatingBox"
     sees_faces: ClassVar[bool] = True
     meets_constraints: ClassVar[bool] = False

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, Scalar
-from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
-from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, carried_by_motion
+from mpmjax.boundary._conditions import Conditions, prescribed
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractMotion, AbstractRegion, Motion
@@ -53,10 +53,10 @@ class Grip(AbstractBoundary):
         held = self.region.contains(place, ON_THE_WALL * spacing)[:, None]
         axes = jnp.ones(nodes.shape[1], dtype=bool) if self.axes is None else jnp.asarray(self.axes)
         fixed = held & axes
-        return Conditions(fixed, jnp.where(fixed, self.motion.velocity_of(place, t, dt), 0))
+        return prescribed(fixed, self.motion.velocity_of(place, t, dt), nodes.dtype)
 
     def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector:
-        return nodes + self.motion.place(nodes, t) - self.motion.place(nodes, 0.0)
+        return carried_by_motion(self.motion, nodes, t)
 
     def pivot(self, t: Scalar) -> Float[Array, "d"]:
         """The region's middle."""
@@ -109,7 +109,7 @@ class RigidPart(AbstractBoundary):
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = 0 in the directions in which it may not move."""
         guided = jnp.zeros(self.dim, bool) if self.free is None else ~jnp.asarray(self.free)
-        return Conditions(self.holds(nodes, spacing)[:, None] & guided, jnp.zeros_like(nodes), moves=False)
+        return prescribed(self.holds(nodes, spacing)[:, None] & guided, None, nodes.dtype)
 
     def extend_to_body(self, fixed: Mask, value: Array, nodes: NodeVector, spacing: Scalar) -> tuple[Mask, Array]:
         """A component that is prescribed at one of its nodes is so at all of them, as at the first."""

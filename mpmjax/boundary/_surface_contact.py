@@ -14,6 +14,7 @@ from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -134,17 +135,13 @@ class Springs(AbstractSpring):
         return jnp.stack([sign * shift - growth for sign in SIGNS[: len(self.stretch)]])
 
     def spread(self, amount: Float[Array, "s p"], size: int) -> Forces:
-        return Forces(value=along(amount) * self.normal, slopes=-amount.sum(axis=0) * self.arm[:, None] * self.normal)
+        along = amount[0] - amount[1:].sum(axis=0)  # the normal of the first surface
+        return Forces(value=along * self.normal, slopes=-amount.sum(axis=0) * self.arm[:, None] * self.normal)
 
     def diagonal(self, stencil: Stencil, size: int) -> Forces:
         """Without the products of weights and their derivatives."""
         k = self.stiffness.sum(axis=0)
         return Forces(value=k * self.normal**2, slopes=k * (self.arm[:, None] * self.normal) ** 2)
-
-
-def along(amount: Float[Array, "s p"]) -> Float[Array, "p"]:
-    """The sum of amounts along the normal of each surface, along that of the first."""
-    return amount[0] if len(amount) == 1 else amount[0] - amount[1]
 
 
 class Surface(NamedTuple):
@@ -190,11 +187,6 @@ class SurfaceContact(AbstractSpringContact):
     def spread(self, stretch: Array, stiffness: Array) -> Springs:
         return Springs(stretch, stiffness, self.normal, self.arm)
 
-    def reached(self, active: Array, shape: tuple[int, ...]) -> Bool[Array, "n d"]:
-        """All components of the nodes around the particles held."""
-        shut = (active & self.near).any(axis=0).astype(self.gap.dtype)
-        return jnp.broadcast_to(scatter(self.faces.stencil, shut[None], None, shape[0]) > 0, shape)
-
     @staticmethod
     def stability_rate(contacts: tuple[Any, ...], nodal_mass: NodeScalar, mass: Array, steepness: Array) -> Array:
         """n k (1 + A b²)/m, with n the largest eigenvalue of the sum of n nᵀ over the surfaces whose springs a particle
@@ -210,18 +202,21 @@ class SurfaceContact(AbstractSpringContact):
     ) -> Callable[[NodeVector], NodeVector]:
         pushes, (size, d) = jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0), residual.shape
         push, mirror = pushes.sum(axis=0), held.nodes.potential.mirror
-        around = [(self.coefficient * push)[None]]
-        if self.axis is None:
-            velocity = jnp.zeros_like(self.normal) if self.velocity is None else self.velocity
-            around += [push[None], along(pushes) * self.normal, push * velocity]
-        sums = scatter(self.faces.stencil, jnp.concatenate(around), None, size)
-        limit = mirror.fold_scalar(sums[:, 0])
+        limit = self.coefficient * push
         if self.axis is not None:
-            normal = (jnp.arange(d) == self.axis).astype(limit.dtype)
-            return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, 0.0, limit, v)
-        pushed, normal = mirror.fold_scalar(sums[:, 1]), mirror.fold(sums[:, 2 : d + 2])
-        moving = mirror.fold(sums[:, d + 2 :]) / jnp.where(pushed == 0, 1, pushed)[:, None]
-        return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, moving, limit, v)
+            limit = mirror.fold_scalar(scatter(self.faces.stencil, limit[None], None, size)[:, 0])
+            normal, moving = (jnp.arange(d) == self.axis).astype(limit.dtype), 0.0
+        else:
+            velocity = jnp.zeros_like(self.normal) if self.velocity is None else self.velocity
+            around = jnp.concatenate(
+                [limit[None], push[None], (pushes[0] - pushes[1:].sum(axis=0)) * self.normal, push * velocity]
+            )
+            sums = scatter(self.faces.stencil, around, None, size)
+            limit, pushed = mirror.fold_scalar(sums[:, :2]).T
+            # both in one pass: each map of a surface is large to compile
+            normal, moving = jax.vmap(mirror.fold, 1)(sums[:, 2:].reshape(size, 2, d))
+            moving = moving / jnp.where(pushed == 0, 1, pushed)[:, None]
+        return friction_change(held.nodes.projection, held.nodes.mass, normal, moving, limit)
 
 
 def surface_contact(surface: Surface, faces: Faces) -> SurfaceContact:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mpmjax._types import Array, Bool, Corner, Float, Int, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
-from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
+from mpmjax.boundary._conditions import Conditions, no_conditions, prescribed
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
 from mpmjax.boundary._surface_contact import SIGNS, Faces, Surface, refuse_contact, surface_contact
@@ -108,7 +108,7 @@ class AbstractHoldingBox(AbstractBox):
         fixed = below | (place >= jnp.asarray(self.upper, nodes.dtype) - ON_THE_WALL * spacing)
         if self.sticks:
             fixed = jnp.broadcast_to(fixed.any(axis=1, keepdims=True), nodes.shape)
-        return held_by_wall(fixed, self.motion, nodes, t, dt)
+        return prescribed(fixed, self.wall_velocity(nodes, t, dt), nodes.dtype)
 
     def planes(self, t: Scalar) -> tuple[FlatWall, ...]:
         """Two an axis."""

@@ -275,7 +275,7 @@ def _force_displacement(
     collider: int = 0,
     boundary: int | None = None,
 ) -> Force:
-    what, number, bodies = "collider", collider, [b for b in m.simulation.scene.boundary if b.collider_count]
+    what, number, bodies = "collider", collider, [b for b in m.simulation.scene.boundary if b.is_collider]
     if boundary is not None:
         what, number, bodies = "boundary", boundary, m.simulation.scene.boundary
     require(0 <= axis < m.dim, f"{_HEADER} axis must be below {m.dim}, got {axis}.")

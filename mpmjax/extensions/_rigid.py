@@ -9,7 +9,7 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Int, Mask, Matrix, NodeScalar, NodeVector, Scalar
-from mpmjax.boundary import AbstractNodes, OwnedCouple
+from mpmjax.boundary import OwnedCouple
 from mpmjax.checks import as_plain, positive, require, require_fields
 from mpmjax.geometry import RigidBody, moment, rigid_body, rotation_of, rotation_of_chords, spinning, turn
 from mpmjax.material import AbstractMaterial
@@ -152,7 +152,7 @@ class RigidConstraint(AbstractConstraint):
         )
 
     def at_start(
-        self, scene: Any, particles: Particles, nodes: AbstractNodes, planes: Mirror
+        self, scene: Any, particles: Particles, nodes: Any, planes: Mirror
     ) -> tuple[RigidImage, NodeVector, Mask, NodeVector]:
         grid, d, conditions, dt = scene.grid, particles.dim, nodes.conditions, nodes.dt
         body, places = self._body(particles), scene.nodes(particles, 0.0)  # at any time: planes beside it rest

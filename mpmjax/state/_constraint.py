@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, Mask, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary import AbstractNodes, OwnedCouple
+from mpmjax.boundary import OwnedCouple
 from mpmjax.potential import AbstractImage, Mirror
 from mpmjax.state._particles import Particles
 
@@ -57,7 +57,7 @@ class AbstractConstraint(eqx.Module):
 
     @abc.abstractmethod
     def at_start(
-        self, scene: Any, particles: Particles, nodes: AbstractNodes, planes: Mirror
+        self, scene: Any, particles: Particles, nodes: Any, planes: Mirror
     ) -> tuple[AbstractLayerImage, NodeVector, Mask, NodeVector]:
         """The map of the body's nodes in a step; and of its layer the velocity at the start [m/s], the components that
         are held, and their velocity, each (m, d): at the nodes of q, and zero or False elsewhere. All particles are

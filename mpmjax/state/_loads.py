@@ -62,14 +62,24 @@ class AbstractLoad(eqx.Module):
         return False
 
 
-def _check_dead_load(name: str, load: AbstractLoad, value: ChangingVector, dim: int) -> None:
-    """Check a load of `value` a weight, a vector that keeps its direction."""
-    AbstractLoad.check(load, dim)
-    size = vector_size(value)
-    require(size == dim, f"{name} must have {dim} components, as the grid has directions, got {size or 'a number'}.")
+class AbstractDeadLoad(AbstractLoad):
+    """A force a weight of the points that keeps its direction. Linear, and so exact inside an implicit solve."""
+
+    value: ClassVar[str]  # the field with the force, (d,), or a `TimeSeries` of it
+    __check_init__ = require_fields
+
+    def check(self, dim: int) -> None:
+        AbstractLoad.check(self, dim)
+        size, name = vector_size(getattr(self, self.value)), f"{type(self).__name__}'s {self.value}"
+        require(
+            size == dim, f"{name} must have {dim} components, as the grid has directions, got {size or 'a number'}."
+        )
+
+    def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
+        return points.weight * value_at(getattr(self, self.value), t)[:, None]
 
 
-class Traction(AbstractLoad):
+class Traction(AbstractDeadLoad):
     """A dead traction on a surface: a force per undeformed area that keeps its direction. Linear, and so exact inside
     an implicit solve.
 
@@ -80,16 +90,10 @@ class Traction(AbstractLoad):
 
     on: AbstractPlace
     traction: Annotated[ChangingVector, require_some, "N/m²"]
-    __check_init__ = require_fields
-
-    def check(self, dim: int) -> None:
-        _check_dead_load("Traction's traction", self, self.traction, dim)
-
-    def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
-        return points.weight * value_at(self.traction, t)[:, None]
+    value: ClassVar[str] = "traction"
 
 
-class PointLoad(AbstractLoad):
+class PointLoad(AbstractDeadLoad):
     """A force at a point, or shared by several, as by those of a line. It keeps its direction. Linear, and so exact
     inside an implicit solve.
 
@@ -103,13 +107,7 @@ class PointLoad(AbstractLoad):
 
     on: AbstractPlace
     total: Annotated[ChangingVector, require_some, "N"]
-    __check_init__ = require_fields
-
-    def check(self, dim: int) -> None:
-        _check_dead_load("PointLoad's total", self, self.total, dim)
-
-    def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
-        return points.weight * value_at(self.total, t)[:, None]
+    value: ClassVar[str] = "total"
 
 
 class Pressure(AbstractLoad):

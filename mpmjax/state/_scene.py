@@ -297,7 +297,7 @@ class Scene(eqx.Module):
     @property
     def collider_count(self) -> int:
         """Number of colliders."""
-        return sum(boundary.collider_count for boundary in self.boundary)
+        return sum(boundary.is_collider for boundary in self.boundary)
 
     @property
     def total(self) -> bool:

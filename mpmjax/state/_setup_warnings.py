@@ -57,7 +57,7 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
                 why = ", or nearer to it than a quarter of their width: it pushes their faces away, half a width"
                 why += " before their centres. Move one of them."
             warn(f"{inside} of {len(x)} particles lie in or beyond the {name} at the start{why}")
-        may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
+        may_meet = not total and condition.is_collider  # material comes to it: any node will do
         if mask is None:
             if not grid.follow and _stays_outside(condition, grid):
                 warn(f"The {name} touches nothing, since it never comes into the grid's window: move it or the grid.")
@@ -218,9 +218,7 @@ def _probe(
         distance = body.distance(nodes, t) if body.pushes else None
         if distance is not None:
             return distance <= grid.spacing
-        conditions = body.conditions(nodes, grid.spacing, t, dt, reference=total)
-        acts, colliders = conditions.fixed.any(axis=1), conditions.colliders
-        return acts if colliders is None else acts | colliders.touched
+        return body.conditions(nodes, grid.spacing, t, dt, reference=total).touched
 
     return [covered(b) for b in boundary], [touched(b) if r else None for b, r in zip(boundary, resting, strict=True)]
 

@@ -1,12 +1,10 @@
 """The impulse that each boundary of a scene receives in a step, from the motion of the nodes and what made it."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Mask, NodeVector, Scalar
-from mpmjax.boundary import ConstrainedNodes, Impulses, OwnedImpulse, owners_of, received_impulses, taken_by_mirrors
+from mpmjax.boundary import ConstrainedNodes, Impulses, OwnedImpulse, received_impulses, taken_by_mirrors
 from mpmjax.discretisation import Gathered
 from mpmjax.potential import Image, Mirror, SurfaceImage
 from mpmjax.state import Particles, Scene
@@ -15,34 +13,32 @@ from mpmjax.stepping._integrator import AbstractIntegrator
 from mpmjax.stepping._nodes import Nodes, places_of
 
 
-def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> Impulses:
-    """The impulse on the scene's colliders, at their places at the time of the forces, by prescribed components, along
-    normals, by springs and friction, from the nodes at the start of the step and their update."""
-    colliders, share = nodes.conditions.colliders, method.force_at()
-    assert colliders is not None
-    position, pivots = colliders.position, colliders.pivots
-    if share is not None:
-        position = position + share * nodes.dt * nodes.potential.mirror.unfold(new.motion.carrier)
-        pivots = pivots + share * nodes.dt * colliders.pivot_velocity
-    held, numbers = new.held(nodes), _boundaries_of_colliders(scene)
+def impulse_on_colliders(
+    scene: Scene,
+    particles: Particles,
+    t: Scalar,
+    unfolded: Nodes,
+    nodes: Nodes,
+    method: AbstractIntegrator,
+    new: GridUpdate,
+) -> Impulses:
+    """The impulse on the scene's colliders by prescribed components, along normals, by springs and friction (see
+    `impulse_on_boundaries`), on true nodes alone."""
+    held, owners = new.held(nodes), unfolded.conditions.owner
+    assert owners is not None
     holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
-    parts = list(held.along_normals(holding))
-    of_walls, holding = taken_by_mirrors(held.without_collider_impulses(holding), held.walls)
-    for part in of_walls:
-        if isinstance(part.owner, int) and part.owner in numbers:
-            parts.append(replace(part, owner=numbers.index(part.owner)))
-    parts.append(OwnedImpulse(holding, colliders.holder))
-    for number, mine in _taken_by_contacts(held, colliders.holder >= 0):
-        if number in numbers:
-            parts.append(OwnedImpulse(jnp.where(mine, holding, 0), numbers.index(number)))
+    parts = _of_what_holds(held, holding, owners)
     mass, tied = (nodes if nodes.loose is None else nodes.loose).mass[:, None], Mirror(nodes.tied)
-    for number, contact, active, change in zip(
-        nodes.brought_by, nodes.contacts, held.active, new.friction, strict=True
-    ):
-        if number in numbers:  # by springs and friction
-            rubbed, impulse = mass * tied.unfold(change), contact.spring_impulse(held, active)
-            parts.append(OwnedImpulse(rubbed if impulse is None else rubbed + impulse, numbers.index(number)))
-    return received_impulses(parts, position, pivots)
+    contacts = zip(nodes.brought_by, nodes.contacts, held.active, new.friction, strict=True)
+    for number, contact, active, change in contacts:
+        if number is not None and scene.boundary[number].is_collider:
+            parts.append(OwnedImpulse(mass * tied.unfold(change), number))
+            if (push := contact.spring_impulse(held, active)) is not None:
+                parts.append(OwnedImpulse(push, number))
+    moved = nodes.potential.mirror.unfold(new.motion.carrier)
+    places, pivots = _places_and_pivots(scene, particles, t, unfolded, owners, method, moved)
+    on = {number: pivots[number] for number, boundary in enumerate(scene.boundary) if boundary.is_collider}
+    return received_impulses(parts, places, on)
 
 
 def impulse_on_boundaries(
@@ -62,10 +58,10 @@ def impulse_on_boundaries(
         whole = jax.tree.map(unfold, whole)
         elastic = None if unfolded.f is None else method.elastic_impulse(unfolded, whole)
     residual = reaction(unfolded, whole, elastic)
-    window, at = scene.window(particles), scene.nodes(particles, t)
+    window, owners = scene.window(particles), unfolded.conditions.owner
+    assert owners is not None
     images = [(n, i) for n, each in enumerate(scene.boundary) for i in each.mirror_images(scene.grid, window, t, dt)]
     contacts = list(zip(nodes.brought_by, nodes.contacts, held.active, strict=True))
-    owners = owners_of(scene.boundary, at, scene.grid.spacing, t, dt, reference=scene.total)
     planes = [(number, image) for number, image in images if isinstance(image, Image)]
     solved, couples, soft = new.solved.velocity, [], jnp.ones_like(unfolded.mass, dtype=bool)
     for constraint, image in zip(scene.constraints, nodes.tied, strict=True):
@@ -96,46 +92,59 @@ def impulse_on_boundaries(
     of_planes, residual = taken_by_mirrors(residual, images)
     parts += of_planes
 
-    # then colliders along their normals, contact planes, and what is prescribed
-    numbers = jnp.asarray(_boundaries_of_colliders(scene), jnp.int32)
-    for part in held.along_normals(residual):
-        parts.append(OwnedImpulse(part.impulse, jnp.where(part.owner < 0, -1, numbers[part.owner])))
-        residual = residual - part.impulse
-    of_planes, residual = taken_by_mirrors(residual, held.walls)
-    parts += [*of_planes, OwnedImpulse(residual, owners)]
-    for number, mine in _taken_by_contacts(held, owners >= 0):
-        parts.append(OwnedImpulse(jnp.where(mine, residual, 0), number))
-
+    parts += _of_what_holds(held, residual, owners)
     for (number, _, _), change in zip(contacts, new.friction, strict=True):
         of_planes, friction = taken_by_mirrors(unfolded.mass[:, None] * unfold(change), images)
         parts += of_planes
         if number is not None:
             parts.append(OwnedImpulse(friction, number))
 
-    # about where nodes and pivots are at the time of the forces
-    places = _carried(scene, particles, t, unfolded, at, owners) if scene.total else at
-    pivots, force_at = _pivots(scene, t, residual), method.force_at()
-    if force_at is not None:
-        moved = unfold(new.motion.carrier)
-        for image in nodes.tied:
-            moved = image.with_own(moved, image.places(new.motion.carrier))
-        places = places + force_at * dt * moved
-        pivots = pivots + force_at * (_pivots(scene, t + dt, residual) - pivots)
+    moved = unfold(new.motion.carrier)
+    for image in nodes.tied:
+        moved = image.with_own(moved, image.places(new.motion.carrier))
+    places, pivots = _places_and_pivots(scene, particles, t, unfolded, owners, method, moved)
     return received_impulses(parts, places, pivots, couples)
 
 
-def _carried(scene: Scene, particles: Particles, t: Scalar, nodes: Nodes, at: NodeVector, owners: Array) -> NodeVector:
-    """Where body, boundaries and colliders have moved the nodes `at` the reference configuration [m]."""
-    moved = places_of(particles, nodes.potential.stencil, scene.grid.size)
-    places, colliders = jnp.where(nodes.occupied, moved, at), nodes.conditions.colliders
-    for number, boundary in enumerate(scene.boundary):
-        carried = boundary.carried(at, t)
-        if carried is not None:
-            places = jnp.where((owners == number).all(axis=1, keepdims=True), carried, places)
-    return places if colliders is None else jnp.where(colliders.touched[:, None], colliders.position, places)
+def _places_and_pivots(
+    scene: Scene,
+    particles: Particles,
+    t: Scalar,
+    nodes: Nodes,
+    owners: Array,
+    method: AbstractIntegrator,
+    moved: NodeVector,
+) -> tuple[NodeVector, dict[int, Array]]:
+    """Where nodes and the boundaries' pivots are at the time of the forces [m], as nodes move with a velocity [m/s]. In
+    the total description body and boundaries have moved the nodes of the reference configuration."""
+    places = at = scene.nodes(particles, t)
+    if scene.total:
+        places = jnp.where(nodes.occupied, places_of(particles, nodes.potential.stencil, scene.grid.size), at)
+        for number, boundary in enumerate(scene.boundary):
+            carried = boundary.carried(at, t)
+            places = places if carried is None else jnp.where(owners == number, carried, places)
+
+    def pivots(t: Scalar) -> Array:
+        each = [boundary.pivot(t) for boundary in scene.boundary] + [None] * len(scene.guides)
+        return jnp.stack([jnp.zeros_like(at[0]) if one is None else jnp.asarray(one, at.dtype) for one in each])
+
+    points, share = pivots(t), method.force_at()
+    if share is not None:
+        places, points = places + share * nodes.dt * moved, points + share * (pivots(t + nodes.dt) - points)
+    return places, dict(enumerate(points))
 
 
-def _taken_by_contacts(held: ConstrainedNodes[Nodes], taken: Mask) -> list[tuple[int, Mask]]:
+def _of_what_holds(held: ConstrainedNodes, residual: NodeVector, owners: Array) -> list[OwnedImpulse]:
+    """The parts of an impulse that holds nodes by colliders along their normals, walls and contacts, and by what
+    prescribes components."""
+    parts = list(held.along_normals(residual))
+    of_walls, residual = taken_by_mirrors(held.without_collider_impulses(residual), held.walls)
+    parts += [*of_walls, OwnedImpulse(residual, owners)]
+    taken = _taken_by_contacts(held, owners >= 0)
+    return parts + [OwnedImpulse(jnp.where(mine, residual, 0), number) for number, mine in taken]
+
+
+def _taken_by_contacts(held: ConstrainedNodes, taken: Mask) -> list[tuple[int, Mask]]:
     """The components whose impulse is that of each contact, by its boundary's number: first what contacts fix, then all
     of the nodes that surfaces reach. There masses that are one in all directions are not BᵀMB, and what differs,
     without a sum along a plane, is the surface's."""
@@ -148,15 +157,3 @@ def _taken_by_contacts(held: ConstrainedNodes[Nodes], taken: Mask) -> list[tuple
             parts.append((number, mask & ~taken))
             taken = taken | mask
     return parts
-
-
-def _boundaries_of_colliders(scene: Scene) -> list[int]:
-    """The number of the boundary that each collider is."""
-    return [n for n, boundary in enumerate(scene.boundary) for _ in range(boundary.collider_count)]
-
-
-def _pivots(scene: Scene, t: Scalar, like: NodeVector) -> Array:
-    """The points about which torques are taken at time t [m], shape (b, d)."""
-    pivots = [boundary.pivot(t) for boundary in scene.boundary] + [None] * len(scene.guides)
-    origin = jnp.zeros(like.shape[1], like.dtype)
-    return jnp.stack([origin if pivot is None else jnp.asarray(pivot, like.dtype) for pivot in pivots])

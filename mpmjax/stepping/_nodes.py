@@ -12,7 +12,6 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
 from mpmjax.boundary import (
     AbstractContact,
-    AbstractNodes,
     Conditions,
     FreeNormal,
     combined_conditions,
@@ -26,7 +25,7 @@ from mpmjax.state import AbstractLayerImage, Particles, Scene, load_force, point
 from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
 
 
-class Nodes(AbstractNodes):
+class Nodes(eqx.Module):
     """The nodes at the start of a step, with the step and the boundaries: the input of an integrator."""
 
     mass: NodeScalar  # m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes (see `p2g`)
@@ -84,12 +83,12 @@ class Nodes(AbstractNodes):
     @property
     def free_normals(self) -> tuple[FreeNormal, ...]:
         """The free parts of the colliders' normals (see `Conditions.free_normals`)."""
-        return self.conditions.free_normals(self.free) if self.conditions.colliders is not None else ()
+        return self.conditions.free_normals(self.free)
 
     @property
     def projection(self) -> Projection:
         """The projection on the components of velocity that nothing holds."""
-        if self.conditions.colliders is None:
+        if not self.conditions.slides:
             return Projection(self.free)
         return Projection(self.free, tuple(part.direction for part in self.free_normals))
 
@@ -98,9 +97,9 @@ class Nodes(AbstractNodes):
         """The velocity of held components [m/s], shape (n, d)."""
         velocity, images = self.conditions.velocity, self.potential.mirror
         velocity = images.with_motion(velocity) if images.images else velocity
-        if self.conditions.colliders is None or not (parts := self.free_normals):
+        if not self.conditions.slides:
             return velocity
-        along = reduce(jnp.add, (part.direction * part.speed[:, None] for part in parts))
+        along = reduce(jnp.add, (part.direction * part.speed[:, None] for part in self.free_normals))
         return jnp.where(self.free, along, velocity)
 
     def inertial_velocity(self) -> NodeVector:
@@ -243,12 +242,6 @@ def with_boundaries(
     grid, window, dt, potential = scene.grid, scene.window(particles), nodes.dt, nodes.potential
     places = scene.nodes(particles, t)
     conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)
-    if scene.total and conditions.colliders is not None and conditions.colliders.slides:
-        slid = reduce(jnp.logical_or, (slide.normal.any(axis=1) for slide in conditions.colliders.slides))
-        # where it slid the node is not where the collider took it for, and its torque acts where it is
-        moved = places_of(particles, potential.stencil, grid.size)
-        place = jnp.where(slid[:, None] & nodes.occupied, moved, conditions.colliders.position)
-        conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
     faces, walls = None, ()
     flows = any(law.flows for law in scene.laws) and any(boundary.holds_fluids for boundary in scene.boundary)
     if flows or any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
@@ -282,7 +275,7 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar
         for image, *parts in bodies:
             layers = [image.with_own(field, layer) for field, layer in zip(layers, parts, strict=True)]
         v, fixed, prescribed = layers
-        conditions = Conditions(fixed, prescribed, nodes.conditions.colliders)
+        conditions = replace(nodes.conditions, fixed=fixed, velocity=prescribed, holds=True, moves=True)
         return replace(nodes, v=v, conditions=conditions, loose=loose, tied=tied)
     return nodes.folded(images) if images.images else nodes
 

@@ -88,8 +88,8 @@ def step_unchecked(
     error, scale, colliders, boundaries = zero, zero, None, None
     if force_at is not None and new.elastic is not None:
         error, scale = force_error(scene, nodes, method, force_at, new.solved, new.elastic, trial, after)
-    if nodes.conditions.colliders is not None:
-        colliders = impulse_on_colliders(scene, nodes, method, new)
+    if scene.collider_count:
+        colliders = impulse_on_colliders(scene, particles, t, unfolded, nodes, method, new)
     if scene.boundary_forces:
         boundaries = impulse_on_boundaries(scene, particles, t, unfolded, nodes, method, new)
     return after, StepInfo(
