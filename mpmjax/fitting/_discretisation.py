@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Float
-from mpmjax.fitting._evaluation import parts_kept, residuals_at
+from mpmjax.fitting._evaluation import residuals_at
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._uncertainty import uncertainty
 
 
@@ -33,9 +33,7 @@ class CoarseGrid(NamedTuple):
     residuals: Float[np.ndarray, "m"]  # those of the minimum on twice the spacing
 
 
-def look_at_coarse_grid(
-    problem: FitProblem, z: Coordinates, sigmas: Sigmas, jacobian: Float[np.ndarray, "m n"]
-) -> CoarseGrid | str:
+def look_at_coarse_grid(problem: FitProblem, z: Coordinates, jacobian: Float[np.ndarray, "m n"]) -> CoarseGrid | str:
     """The look at twice the spacing from the minimum z, or why there is none.
 
     Gauss-Newton steps −(JᵀJ)⁻¹ Jᵀ r with the residuals r of the coarse grid and the Jacobian of the fine one, three at
@@ -49,10 +47,9 @@ def look_at_coarse_grid(
         except ValueError as error:
             return str(error)
         coarse, least, tried = eqx.tree_at(lambda p: p.experiments, problem, experiments), np.inf, places[-1:]
-        kept = parts_kept(coarse, 1)
         for _ in range(_STEPS):
             try:
-                r = np.asarray(residuals_at(coarse, jnp.asarray(tried[-1:], problem.dtype), sigmas, kept), float)[0]
+                r = np.asarray(residuals_at(coarse, np.array(tried[-1:])), float)[0]
             except KeyboardInterrupt:
                 return "interrupted."
             first = r if first is None else first

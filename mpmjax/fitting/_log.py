@@ -28,7 +28,7 @@ import numpy as np
 from mpmjax.checks import require
 from mpmjax.fitting._evaluation import Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas
+from mpmjax.fitting._problem import SHOWN, FitProblem
 from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
 from mpmjax.io import ReplacedFile, check_hdf5, reason, reporting
 
@@ -37,8 +37,8 @@ _ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), (
 _MOST = 8  # numbers of an array that are written out
 _FREE = ("optimiser.max_steps",)  # choices that may differ in a fit that is continued: it may go on for longer
 
-Past = tuple[int, tuple[Iteration, ...], Sigmas, Search]
-"""Number of rounds before the last one, and their iterations; noise of the last one, and its search."""
+Past = tuple[int, tuple[Iteration, ...], FitProblem, Search]
+"""Number of rounds before the last one, and their iterations; the problem with its noise, and its search."""
 
 
 @contextmanager
@@ -49,9 +49,9 @@ def recorded(
     path: Path | None,
     *,
     resume: bool,
-) -> Iterator[tuple[Past | None, Callable[[Sigmas, Search], None]]]:
-    """The past of a fit that a log holds, if it is to `resume`, and a function that records a search with the noise of
-    its round after each iteration: in the log at this path, by lines of progress, or both."""
+) -> Iterator[tuple[Past | None, Callable[[FitProblem, Search], None]]]:
+    """The past of a fit that a log holds, if it is to `resume`, and a function that records a search of the problem,
+    with the noise of its round, after each iteration: in the log at this path, by lines of progress, or both."""
     rows, places, values, noise, past = [], [], [], [], None
     with ExitStack() as stack:
         if path is not None:
@@ -104,11 +104,11 @@ def recorded(
         begun = time.perf_counter() - (rows[-1][-1] if rows else 0.0)
         say = None if progress is None else _lines(problem, optimiser, progress, len(rows))
 
-        def record(sigmas: Sigmas, search: Search) -> None:
+        def record(problem: FitProblem, search: Search) -> None:
             iteration, seconds = search.history[-1], time.perf_counter() - begun
             if path is not None:
                 if iteration.number == 0:
-                    noise.append(sigmas)
+                    noise.append(problem.sigmas)
                 rows.append((len(noise) - 1, *iteration[:4], seconds))
                 places.append(iteration.z)
                 values.append(np.asarray(problem.numbers(jnp.asarray(iteration.z, problem.dtype)), float))
@@ -158,7 +158,7 @@ def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: d
             names = [name for name in Evaluation._fields if f"resume/seen/{name}" in arrays]
             parts: dict[str, Any] = {name: arrays[f"resume/seen/{name}"] for name in names}
             seen = Evaluation(**parts)
-            like = eqx.filter_eval_shape(optimiser.begin, problem, jnp.zeros(problem.size), noise[-1])
+            like = eqx.filter_eval_shape(optimiser.begin, problem, jnp.zeros(problem.size))
             shapes, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
             leaves, tree = jax.tree.flatten(shapes)
             state = []
@@ -171,7 +171,12 @@ def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: d
                 # As weakly typed as it was, or the next iteration would compile anew.
                 state.append(jnp.asarray(data.item() if leaf.weak_type and data.ndim == 0 else data))
             inner = eqx.combine(jax.tree.unflatten(tree, state), rest)
-            past = rounds - 1, earlier, noise[-1], Search(jnp.asarray(places[-1]), inner, seen, history)
+            past = (
+                rounds - 1,
+                earlier,
+                problem.with_noise(noise[-1]),
+                Search(jnp.asarray(places[-1]), inner, seen, history),
+            )
         return rows, places, list(arrays["values"]), noise, past
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(damaged.format(reason(error))) from None

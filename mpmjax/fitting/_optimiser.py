@@ -14,7 +14,7 @@ import optax
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import as_floats, positive, require_fields, require_positive, tolerance, whole
 from mpmjax.fitting._evaluation import Evaluation, of_residuals
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._search import AbstractOptimiser, Search
 
 
@@ -48,7 +48,7 @@ class LevenbergMarquardt(AbstractOptimiser):
     max_steps: Annotated[int, whole(1)] = eqx.field(static=True, default=300)
     mode: Literal["forward", "reverse"] | None = eqx.field(static=True, default=None)
 
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "DampedState":
+    def begin(self, problem: FitProblem, z: Coordinates) -> "DampedState":
         no = jnp.asarray(False)
         return DampedState(z, jnp.ones((), z.dtype), jnp.zeros((), jnp.int32), no, no)
 
@@ -56,10 +56,10 @@ class LevenbergMarquardt(AbstractOptimiser):
         return state.trial if (self.mode or problem.cheaper_mode) == "forward" else None
 
     def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "DampedState"
+        self, problem: FitProblem, z: Coordinates, state: "DampedState"
     ) -> tuple[Coordinates, "DampedState", Evaluation]:
         z = state.trial.astype(problem.dtype)
-        return state.trial, state, of_residuals(*problem.jacobian(z, sigmas, self.mode), problem.room(z))
+        return state.trial, state, of_residuals(*problem.jacobian(z, self.mode), problem.room(z))
 
     def directed(
         self, before: Search, z: Coordinates, state: "DampedState", seen: Evaluation
@@ -230,28 +230,26 @@ class LBFGS(AbstractOptimiser):
     memory: Annotated[int, whole(1)] = eqx.field(static=True, default=20)
     line_search: Annotated[int, whole(1)] = eqx.field(static=True, default=20)
 
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "LBFGSState":
+    def begin(self, problem: FitProblem, z: Coordinates) -> "LBFGSState":
         no, zero, none = jnp.asarray(False), jnp.zeros((), z.dtype), jnp.zeros((), jnp.int32)
         past: Any = optax.scale_by_lbfgs(self.memory).init(z)
         return LBFGSState(no, zero, jnp.zeros_like(z), past, zero + jnp.inf, zero, none, no)
 
     def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "LBFGSState"
+        self, problem: FitProblem, z: Coordinates, state: "LBFGSState"
     ) -> tuple[Coordinates, "LBFGSState", Evaluation]:
         def start(z: Coordinates, state: LBFGSState) -> tuple[Coordinates, LBFGSState]:
-            _, cost, gradient = problem.gradient(z, sigmas)
+            _, cost, gradient = problem.gradient(z)
             return z, state._replace(begun=~state.begun, cost=cost, gradient=gradient)
 
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers
-            z, state = jax.lax.cond(state.begun, partial(self._search, problem, sigmas), start, z, state)
+            z, state = jax.lax.cond(state.begun, partial(self._search, problem), start, z, state)
         return z, state, Evaluation(state.cost, state.gradient)
 
     def has_converged(self, state: "LBFGSState", seen: Evaluation) -> bool:
         return bool((state.small > 1) | (state.stalled & (state.predicted_decrease <= state.decrease_tolerance)))
 
-    def _search(
-        self, problem: FitProblem, sigmas: Sigmas, z: Coordinates, state: "LBFGSState"
-    ) -> tuple[Coordinates, "LBFGSState"]:
+    def _search(self, problem: FitProblem, z: Coordinates, state: "LBFGSState") -> tuple[Coordinates, "LBFGSState"]:
         """A line search along the quasi-Newton direction, or where nothing is known yet along the negative gradient."""
         cost, gradient = state.cost, state.gradient
         quasi_newton: Any = optax.scale_by_lbfgs(self.memory)
@@ -261,12 +259,12 @@ class LBFGS(AbstractOptimiser):
         along, past = _where(steep, steepest, newton)
         predicted_decrease = jnp.where(steep, jnp.minimum(state.predicted_decrease, gradient @ along), gradient @ along)
         # The part of the cost that may be rounding: each residual has that of the data, ε √Σ (data/σ)².
-        rounding = problem.rounding_of_data(sigmas).astype(cost.dtype)
+        rounding = problem.rounding_of_data().astype(cost.dtype)
         slack = jnp.sqrt(2 * cost) * rounding + rounding**2 + float(jnp.finfo(cost.dtype).eps) * cost
 
         def evaluate(z: Coordinates) -> tuple[Array, Coordinates]:
             """The cost and its derivative; infinite where either fails."""
-            _, cost, gradient = problem.gradient(z, sigmas)
+            _, cost, gradient = problem.gradient(z)
             usable = jnp.isfinite(cost) & jnp.isfinite(gradient).all()
             return jnp.where(usable, cost, jnp.inf), jnp.where(usable, gradient, 0)
 
@@ -347,14 +345,14 @@ class Adam(AbstractOptimiser):
         """The learning rate of an iteration, before any halving."""
         return self.learning_rate(number) if callable(self.learning_rate) else self.learning_rate
 
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "AdamState":
+    def begin(self, problem: FitProblem, z: Coordinates) -> "AdamState":
         one, zero, rate = jnp.ones((), z.dtype), jnp.zeros((), jnp.int32), jnp.asarray(self.rate(0), z.dtype)
         return AdamState(zero, z, _MOMENTS.init(z), one * jnp.inf, jnp.zeros_like(z), one, rate, zero)
 
     def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "AdamState"
+        self, problem: FitProblem, z: Coordinates, state: "AdamState"
     ) -> tuple[Coordinates, "AdamState", Evaluation]:
-        _, cost, gradient = problem.gradient(state.trial, sigmas)
+        _, cost, gradient = problem.gradient(state.trial)
         first = state.number == 0
         usable = jnp.isfinite(cost) & jnp.isfinite(gradient).all()
         lower = usable & (cost < state.cost)

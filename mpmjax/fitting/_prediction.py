@@ -113,7 +113,7 @@ def predict_observations(
         asked = tuple(replace(e, observations=a.observations, t1=a.t1) for e, a in zip(fitted, asked, strict=True))
         values, derivatives = _linearised(result, eqx.Partial(_observed, asked))
     predictions = []
-    each = zip(values, derivatives, observations, result.sigmas, strict=True)
+    each = zip(values, derivatives, observations, result.problem.sigmas, strict=True)
     for number, (value, J, o, sigma) in enumerate(each):
         # The noise of new measurements is the observation's own, or that of the fitted one.
         sigma = np.asarray(sigma if o.sigma is None else o.sigma, float)
@@ -201,13 +201,13 @@ def bootstrap(
     predicted = [np.asarray(y, float) for e in problem.at(z) for y in e.predictions(e.run())]
     problems = []
     for _ in range(repeats):
-        each = zip(problem.observations, predicted, result.sigmas, strict=True)
+        each = zip(problem.observations, predicted, problem.sigmas, strict=True)
         noisy = ((o, y + np.asarray(sigma) * rng.normal(size=y.shape)) for o, y, sigma in each)
         data = [np.where(np.isfinite(o.data), y, np.nan) for o, y in noisy]
         priors = [p.prior.drawn(rng) for p in problem.parameters if p.prior is not None]
         drawn = eqx.tree_at(lambda p: [o.data for o in p.observations], problem, data)
         drawn = eqx.tree_at(lambda q: [p.prior for p in q.parameters if p.prior is not None], drawn, priors)
-        problems.append((drawn, result.sigmas))
+        problems.append(drawn)
     members = search_many(
         problems,
         result.optimiser if optimiser is None else optimiser,

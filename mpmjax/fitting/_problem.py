@@ -23,12 +23,13 @@ Sigmas = tuple[Array, ...]  # the noise of each observation, in its data's unit
 
 
 class FitProblem(eqx.Module):
-    """The residuals of some experiments as a function of the coordinates of some parameters."""
+    """The residuals of some experiments, in units of a noise, as a function of the coordinates of some parameters."""
 
     experiments: tuple[Experiment, ...]  # the experiments, with the first guesses
     names: tuple[str, ...] = eqx.field(static=True)  # the names of the parameters
     parameters: tuple[AbstractParameter, ...]  # what is searched
     starts: tuple[Array, ...]  # the first guess of each
+    sigmas: Sigmas = ()  # the noise of each observation: given, estimated, or the size of its data until then
     memory: int = eqx.field(static=True, default=2**28)  # memory for what reverse mode stores, and for tangents [B]
     plane: tuple[Float[Array, "n"], Float[Array, "n f"]] | None = None  # see `on_plane`
 
@@ -45,6 +46,7 @@ class FitProblem(eqx.Module):
         dtypes = sorted({str(e.dtype) for e in experiments})
         require(len(dtypes) == 1, f"All experiments of a fit must have particles of one precision, got {dtypes}.")
         self.experiments, self.names, self.parameters = experiments, tuple(parameters), tuple(parameters.values())
+        self.sigmas = first_noise(experiments)
         self.starts = tuple(self._start(name, p) for name, p in parameters.items())
         self.parameters = tuple(replace(p, start=start) for p, start in zip(self.parameters, self.starts, strict=True))
         points, freedom = self.points, self.points + self.fixed_by_priors - self.size
@@ -81,6 +83,10 @@ class FitProblem(eqx.Module):
         for k in numbers:
             parameter.check_experiment(name, self.experiments[k])
         return jnp.asarray(start)
+
+    def with_noise(self, sigmas: Sigmas) -> "FitProblem":
+        """The problem with another noise of each observation."""
+        return eqx.tree_at(lambda p: p.sigmas, self, sigmas)
 
     def on_plane(self, origin: np.ndarray, basis: np.ndarray) -> "FitProblem":
         """The problem on a plane of its coordinates, origin + basis y, shapes (n,) and (n, f), as a function of y: one
@@ -131,11 +137,6 @@ class FitProblem(eqx.Module):
         return tuple(o.sigma is not None for o in self.observations)
 
     @property
-    def first_sigmas(self) -> tuple[Array, ...]:
-        """The noise of each observation, or what stands for it until it is estimated."""
-        return tuple(jnp.asarray(o.scale() if o.sigma is None else o.sigma, self.dtype) for o in self.observations)
-
-    @property
     def labels(self) -> tuple[str, ...]:
         """A name for each coordinate: that of its parameter, with an index where that has several."""
         return tuple(
@@ -155,9 +156,9 @@ class FitProblem(eqx.Module):
         return tuple(parameter.logarithmic for parameter in self.owners)
 
     @eqx.filter_jit
-    def rounding_of_data(self, sigmas: Sigmas) -> Array:
+    def rounding_of_data(self) -> Array:
         """ε √Σ (data/σ)², the rounding of what the residuals are the difference of [-]."""
-        each = zip(self.observations, sigmas, strict=True)
+        each = zip(self.observations, self.sigmas, strict=True)
         ratios = (jnp.asarray(o.data, self.dtype) / jnp.asarray(sigma, self.dtype) for o, sigma in each)
         squares = sum((jnp.nansum(ratio**2) for ratio in ratios), jnp.zeros((), self.dtype))
         return float(jnp.finfo(self.dtype).eps) * jnp.sqrt(squares)
@@ -210,11 +211,11 @@ class FitProblem(eqx.Module):
         change = velocity_gradient(experiment.scene, eqx.tree_at(lambda q: q.v, now, now.v - before.v))
         return eqx.tree_at(lambda e: e.particles.C, experiment, now.C + change)
 
-    def residuals(self, z: Coordinates, sigmas: Sigmas, adjoint: Any) -> tuple[Array, Array]:
+    def residuals(self, z: Coordinates, adjoint: Any) -> tuple[Array, Array]:
         """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does
         not reach a measurement; and the reports of tangent solves (`Run.report`). `adjoint` is how diffrax
         differentiates, None reverse mode within the memory."""
-        parts, reports, noise = [], [], iter(sigmas)
+        parts, reports, noise = [], [], iter(self.sigmas)
         for experiment in self.at(z):
             run = experiment.run(adjoint=adjoint, throw=False, checkpoint_bytes=self.memory)
             each = zip(experiment.observations, run.observed, strict=True)
@@ -228,12 +229,12 @@ class FitProblem(eqx.Module):
         each = zip(self.parameters, self.values(z), strict=True)
         return jnp.concatenate([parameter.prior_residuals(value) for parameter, value in each])
 
-    def gradient(self, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array, Coordinates]:
+    def gradient(self, z: Coordinates) -> tuple[Array, Array, Coordinates]:
         """The residuals r, ½ Σ r² and its derivative by the coordinates, by one pass of reverse mode, whatever their
         number. NaN where a simulation met a fault, the derivative also where an adjoint solve did not converge."""
 
         def cost(z: Coordinates) -> tuple[Array, Array]:
-            r = self.residuals(z.astype(self.dtype), sigmas, None)[0].astype(z.dtype)
+            r = self.residuals(z.astype(self.dtype), None)[0].astype(z.dtype)
             return (r**2).sum() / 2, r
 
         (value, r), slope = jax.value_and_grad(cost, has_aux=True)(z)
@@ -249,18 +250,16 @@ class FitProblem(eqx.Module):
                 observation.explain(seen, run)
         raise ValueError(failure)
 
-    def jacobian(
-        self, z: Coordinates, sigmas: Sigmas, mode: Literal["forward", "reverse"] | None = None
-    ) -> tuple[Array, Array]:
+    def jacobian(self, z: Coordinates, mode: Literal["forward", "reverse"] | None = None) -> tuple[Array, Array]:
         """The residuals and their derivative by the coordinates, shape (m, n). NaN where a tangent or adjoint solve did
         not converge. The mode is "forward", a tangent of each coordinate beside the simulation, or "reverse", a pass
         back for each measured number, as many at once as the memory holds; default: the cheaper one."""
         if (self.cheaper_mode if mode is None else mode) == "reverse":
-            r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
+            r, pull, _ = jax.vjp(lambda z: self.residuals(z, None), z, has_aux=True)
             units = np.eye(self.measured, len(r), dtype=r.dtype)  # priors need no simulation
             _, (rows,) = in_batches(lambda unit: ((), pull(unit)), units, self.at_once)
             return r, jnp.concatenate([rows, jax.jacfwd(self.prior_residuals)(z)])
-        evaluate = partial(self.residuals, sigmas=sigmas, adjoint=diffrax.ForwardMode())
+        evaluate = partial(self.residuals, adjoint=diffrax.ForwardMode())
         (r, _), (columns, unsolved) = linearised(evaluate, z, self.at_once)
         return r, jnp.where((unsolved != 0).any(), jnp.nan, columns.T)
 
@@ -277,6 +276,12 @@ class FitProblem(eqx.Module):
             seen = jax.eval_shape(eqx.Partial(observe_all, e.observations), e.scene, e.particles)
             each += _COPIES * size_of(e.particles) + size_of(seen) * (e.steps + 1)
         return max(1, int(self.memory // max(each, 1)))
+
+
+def first_noise(experiments: Sequence[Experiment]) -> Sigmas:
+    """The noise of each observation, or what stands for it until it is estimated."""
+    noise = ((e.dtype, o.scale() if o.sigma is None else o.sigma) for e in experiments for o in e.observations)
+    return tuple(jnp.asarray(sigma, dtype) for dtype, sigma in noise)
 
 
 @eqx.filter_jit

@@ -142,8 +142,8 @@ class _Path:
     def __init__(
         self, result: FitResult, at: int, optimiser: AbstractOptimiser, progress: Callable[[str], None] | None
     ):
-        self.problem, self.sigmas, self.optimiser = result.problem, result.sigmas, optimiser
-        self.at, self.progress, self.uncertainty = at, progress, result.uncertainty
+        self.problem, self.optimiser, self.at = result.problem, optimiser, at
+        self.progress, self.uncertainty = progress, result.uncertainty
         self.start: _Point = np.asarray(result.z, float), 0.0
         self.least, self.visited, self.unsettled = self._misfit(self.start[0]), [self.start], 0
         errors, unit = result.uncertainty, np.eye(self.problem.size)[at]
@@ -169,7 +169,7 @@ class _Path:
         return float(np.log1p(pace)) if np.isfinite(room).any() else pace
 
     def _misfit(self, z: np.ndarray) -> float:
-        return 2 * float(costs_at(self.problem, z[None], self.sigmas, 1)[0])
+        return 2 * float(costs_at(self.problem, z[None], 1)[0])
 
     def visit(self, place: float, last: _Point, before: _Point) -> _Point | None:
         """The least misfit with the coordinate held at a place, from the line through two points, or along the
@@ -183,7 +183,7 @@ class _Path:
         else:
             basis = np.delete(np.eye(len(z)), at, axis=1)
             held = problem.on_plane(z, basis)
-            end = search(held, self.optimiser, jnp.zeros(held.size, problem.dtype), self.sigmas)
+            end = search(held, self.optimiser, jnp.zeros(held.size, problem.dtype))
             if end.interrupted:
                 raise KeyboardInterrupt
             if end.failure:

@@ -20,7 +20,7 @@ from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import Level, chosen_optimiser, fit, require_end
 from mpmjax.fitting._observation import AbstractTimed
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._problem import Coordinates, FitProblem, first_noise
 from mpmjax.fitting._result import FitResult
 from mpmjax.fitting._search import AbstractOptimiser, jacobian, search
 from mpmjax.fitting._starts import Starts, as_starts
@@ -97,7 +97,7 @@ def fit_staged(
         cut = _cut(problem, limits, horizon)
         if [e.steps for e in cut.experiments] == [e.steps for e in whole.experiments]:
             break
-        minimum = search(cut, optimiser, z, cut.first_sigmas)
+        minimum = search(cut, optimiser, z)
         require_end(minimum)
         if minimum.failure:
             cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
@@ -122,7 +122,8 @@ def fit_staged(
 def _cut(problem: FitProblem, limits: Sequence[float], horizon: float) -> FitProblem:
     """The problem of the data until a horizon, and the limit of each experiment."""
     each = zip(problem.experiments, limits, strict=True)
-    return eqx.tree_at(lambda p: p.experiments, problem, tuple(e.until(min(horizon, limit)) for e, limit in each))
+    cut = tuple(e.until(min(horizon, limit)) for e, limit in each)
+    return eqx.tree_at(lambda p: p.experiments, problem, cut).with_noise(first_noise(cut))
 
 
 def _limits(experiments: Sequence[Experiment], growth: float) -> list[float]:
@@ -141,11 +142,11 @@ def _limits(experiments: Sequence[Experiment], growth: float) -> list[float]:
 
 def _first_horizon(problem: FitProblem, z: Coordinates) -> float:
     """The time until which the data are nearly linear in the coordinates [s], see `fit_staged`."""
-    sigmas, parts = problem.first_sigmas, []
-    r, J = (np.asarray(a, float) for a in jacobian(problem, z, sigmas))
+    parts = []
+    r, J = (np.asarray(a, float) for a in jacobian(problem, z))
     if not np.isfinite(r).all():
         problem.explain(z)
-    for o, rows, sigma in zip(problem.observations, problem.rows, sigmas, strict=True):
+    for o, rows, sigma in zip(problem.observations, problem.rows, problem.sigmas, strict=True):
         if isinstance(o, AbstractTimed):
             change = (J[rows] ** 2).reshape(len(o.times), -1, problem.size).sum(axis=1)
             data = o.data.reshape(len(o.times), -1)

@@ -14,7 +14,7 @@ from mpmjax.checks import between, require, require_fields, require_finite, whol
 from mpmjax.fitting._estimate import table
 from mpmjax.fitting._evaluation import costs_at
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas
+from mpmjax.fitting._problem import SHOWN, FitProblem
 from mpmjax.fitting._search import AbstractOptimiser, Search, batch_size, counted, search_many
 
 Ends = list[tuple[Search, list[int]]]  # minima, with the numbers of the points that led there
@@ -122,7 +122,6 @@ def look_around(
     optimiser: AbstractOptimiser,
     starts: Starts,
     first: Search,
-    sigmas: Sigmas,
     enough: Callable[[Search], bool],
     progress: Callable[[str], None] | None,
 ) -> tuple[Search | None, Screening]:
@@ -132,7 +131,7 @@ def look_around(
     points = starting_points(problem, shares, starts)
     size, costs, remark = batch_size(problem, starts.batch, len(points)), np.zeros(len(points)), ""
     if starts.fraction < 1:
-        costs = costs_at(problem, points, sigmas, size, counted(progress, "{} of {} simulations are done"))
+        costs = costs_at(problem, points, size, counted(progress, "{} of {} simulations are done"))
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
     if 2 * len(failures) > len(points):
         try:
@@ -143,7 +142,7 @@ def look_around(
 
     # A program that makes one iteration is compiled already.
     size = 1 if starts.if_needed and starts.batch is None else size
-    search = partial(search_many, [(problem, sigmas)], optimiser, batch=size)
+    search = partial(search_many, [problem], optimiser, batch=size)
     members, stands = _searched(search, first, points, shares, costs, starts.fraction, enough, progress)
     failures |= {k: m.failure for k, m in members.items() if m.failure}
     ends: dict[int, list[int]] = {}
