@@ -9,19 +9,8 @@ import numpy as np
 
 from mpmjax._types import Float
 from mpmjax.fitting._evaluation import residuals_at
-from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._uncertainty import uncertainty
-
-
-def coarsened(experiment: Experiment, longer: int) -> Experiment:
-    """The experiment on twice the spacing, its steps so many times longer, or the next of which t1 is a whole number.
-
-    Raises:
-        ValueError: the coarse grid does not fit a wall that must lie on its nodes, or a period.
-    """
-    scene = eqx.tree_at(lambda s: s.grid, experiment.scene, experiment.scene.grid.coarsened())
-    return replace(experiment, scene=scene, dt=experiment.t1 / -(-experiment.steps // longer))
 
 
 class CoarseGrid(NamedTuple):
@@ -34,17 +23,19 @@ class CoarseGrid(NamedTuple):
 
 
 def look_at_coarse_grid(problem: FitProblem, z: Coordinates, jacobian: Float[np.ndarray, "m n"]) -> CoarseGrid | str:
-    """The look at twice the spacing from the minimum z, or why there is none.
-
-    Gauss-Newton steps −(JᵀJ)⁻¹ Jᵀ r with the residuals r of the coarse grid and the Jacobian of the fine one, three at
-    most of each, while they lower Σ r². What a bound holds has no column in the Jacobian.
-    """
+    """The look at twice the spacing from the minimum z, or why there is none: by Gauss-Newton steps −(JᵀJ)⁻¹ Jᵀ r with
+    the residuals r of the coarse grid and the Jacobian of the fine one, three at most of each, while they lower Σ r².
+    What a bound holds has no column in the Jacobian."""
     inverse = uncertainty(jacobian, float(jnp.finfo(problem.dtype).eps), ()).inverse
     places, first = [np.asarray(z, float)], None
     for longer in (1, 2):
-        try:
-            experiments = tuple(coarsened(e, longer) for e in problem.experiments)
-        except ValueError as error:
+        try:  # steps so many times longer, or the next of which t1 is a whole number
+            scenes = [eqx.tree_at(lambda s: s.grid, e.scene, e.scene.grid.coarsened()) for e in problem.experiments]
+            each = [
+                (e, scene, e.t1 / -(-e.steps // longer)) for e, scene in zip(problem.experiments, scenes, strict=True)
+            ]
+            experiments = tuple(replace(e, scene=scene, dt=dt) for e, scene, dt in each)
+        except ValueError as error:  # of a wall that must lie on nodes, or a period
             return str(error)
         coarse, least, tried = eqx.tree_at(lambda p: p.experiments, problem, experiments), np.inf, places[-1:]
         for _ in range(_STEPS):

@@ -10,22 +10,13 @@ import numpy as np
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import as_floats, require, require_fields, require_finite
 from mpmjax.fitting._columns import ROUNDED, after
-from mpmjax.fitting._experiment import AbstractObservation, Shown
+from mpmjax.fitting._experiment import AbstractObservation
 from mpmjax.fitting._quantities import Markers
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene
 
 
-class _Measured(AbstractObservation):
-    """A measurement whose noise and weight are as `Series` says."""
-
-    sigma: Float[np.ndarray, "..."] | None = eqx.field(converter=as_floats, default=None, kw_only=True)
-    weight: Scalar = eqx.field(converter=as_floats, default=1.0, kw_only=True)
-    robust: Scalar | None = eqx.field(converter=as_floats, default=None, kw_only=True)
-    shown: Shown = eqx.field(default=Shown(), kw_only=True)
-
-
-class Curve(_Measured):
+class Curve(AbstractObservation):
     """A quantity measured against another one: stress against stretch, a force against a displacement.
 
     Args:
@@ -83,7 +74,7 @@ class Curve(_Measured):
         return (measured < x[0] - slack) | (measured > x[-1] + slack)
 
 
-class AbstractTimed(_Measured):
+class AbstractTimed(AbstractObservation):
     """A measurement against time; between steps it is interpolated linearly."""
 
     times: Float[np.ndarray, "f"] = eqx.field(converter=as_floats)

@@ -213,6 +213,15 @@ def leaves_of(where: Callable[[Experiment], Any] | None, experiment: Experiment)
     return leaves if isinstance(leaves, tuple) else (leaves,)
 
 
+def changes(parameter: AbstractParameter, experiment: Experiment, start: Any) -> list[str]:
+    """The dotted paths of the numbers of an experiment that a parameter changes, by a value that is not its start."""
+    other = parameter.put(experiment, jnp.asarray(1 + start + np.abs(start), start.dtype))
+    numbers = (eqx.filter(tree, eqx.is_array_like) for tree in (experiment, other))
+    before, after = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in numbers)
+    unlike = (path for path, a in after.items() if path not in before or not np.array_equal(a, before[path]))
+    return [jax.tree_util.keystr(path).lstrip(".") for path in unlike]
+
+
 class _PlainParameter(AbstractParameter):
     """A parameter whose values are put in as they are."""
 

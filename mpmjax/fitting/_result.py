@@ -216,8 +216,8 @@ def minimum_of(problem: FitProblem, search: Search) -> Minimum:
     r, J = np.asarray(search.seen.residuals), np.asarray(search.seen.jacobian)
     J = J[:, ~at_bound(r, J, np.asarray(problem.room(search.z)))]  # what a bound holds fits nothing away
     settled, changing = [], False
-    each = zip(problem.observations, problem.rows, problem.noise_is_given, problem.sigmas, strict=True)
-    for observation, rows, is_given, sigma in each:
+    for observation, rows, sigma in zip(problem.observations, problem.rows, problem.sigmas, strict=True):
+        is_given = observation.sigma is not None
         factor, freedom = (1.0, 0.0) if is_given else noise(r, J, rows, observation.count, *observation.trust)
         require(
             np.isfinite(factor),
@@ -311,7 +311,7 @@ def _judged(
 ) -> tuple[NoiseEstimate, tuple[slice, float, float], tuple[slice, float, float]]:
     """The noise of observation k by residuals r, of which twice the spacing leaves the `rest` unexplained, and what
     `uncertainty` takes of it: by the noise alone, and by what the misfit shows."""
-    observation, rows, is_given = problem.observations[k], problem.rows[k], problem.noise_is_given[k]
+    observation, rows, is_given = problem.observations[k], problem.rows[k], problem.observations[k].sigma is not None
     (sigma, _, freedom), weight, count = settled[k], observation.trust[0], observation.count
     size, squares = float(np.sqrt((np.asarray(sigma) ** 2).mean())), (r[rows] ** 2).sum()
     misfit = float(np.sqrt(squares / max(count, 1)))

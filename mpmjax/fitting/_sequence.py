@@ -48,13 +48,10 @@ def fit_staged(
 
     The first horizon, where `horizons` does not give it, is the last time until which a change of one in any coordinate
     changes the data by no more than they change themselves, √Σ (∂y/∂z)² ≤ √Σ (y − y(0))², at the first guess: of a
-    vibration about half a period. Where that ratio does not grow with time, as of a drop under gravity, there is but
-    one stage. Horizons then double, to the end, or to the time until which `sensitivity`, at each stage's values, is
-    below `growth`: later data are left out, and a warning says so.
-
-    The last stage is a `fit`, those before it are searches alone: parameters that the data do not see yet stay. Each
-    compiles anew. What has no times, such as a `Curve`, counts in the last stage, or in all if its experiment has
-    nothing else.
+    vibration about half a period. Where that ratio does not grow with time there is but one stage. Horizons then
+    double, to the end, or to the time until which `sensitivity` is below `growth`: later data are left out, with a
+    warning. The last stage is a `fit`, those before it are searches alone, each compiled anew. What has no times, such
+    as a `Curve`, counts in the last stage, or in all if its experiment has nothing else.
 
     Args:
         experiments, parameters, report, level: see `fit`. Horizons are times of each experiment.
@@ -81,8 +78,7 @@ def fit_staged(
         say(text)
 
     z = jnp.zeros(problem.size, problem.dtype)
-    limits = _limits(problem.at(z), float(growth))
-    whole = _cut(problem, limits, end)
+    whole = _until(problem, _limits(problem.at(z), float(growth)))
     if times is None:
         first = _first_horizon(whole, z)
         times = [first * 2.0**k for k in range(_MOST_STAGES) if first * 2.0**k < _NEARLY_ALL * end]
@@ -94,7 +90,7 @@ def fit_staged(
             "more than they change themselves, or by as much at all times."
         )
     for horizon in times:
-        cut = _cut(problem, limits, horizon)
+        cut = _until(whole, [horizon] * len(whole.experiments))
         if [e.steps for e in cut.experiments] == [e.steps for e in whole.experiments]:
             break
         minimum = search(cut, optimiser, z)
@@ -103,12 +99,11 @@ def fit_staged(
             cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
         z, misfit, count = minimum.z, cut.misfit(minimum.cost), len(minimum.history)
         tell(f"until {horizon:.4g} s: misfit/σ {misfit:.4g}, {problem.shown(z)}, {count} iterations")
-        limits = _limits(problem.at(z), float(growth))
-        whole = _cut(problem, limits, end)
-    for k, (e, used, limit) in enumerate(zip(problem.experiments, whole.experiments, limits, strict=True)):
+        whole = _until(problem, _limits(problem.at(z), float(growth)))
+    for k, (e, used) in enumerate(zip(problem.experiments, whole.experiments, strict=True)):
         if used.steps < e.steps:
             tell(
-                f"Of the experiment {e.name!r} (number {k}) data are used only until {limit:.4g} s of "
+                f"Of the experiment {e.name!r} (number {k}) data are used only until {used.t1:.4g} s of "
                 f"{e.t1:.4g} s: beyond, derivatives grow to more than {growth:.3g} times those of free flight, or "
                 "the simulation fails, and a fit would follow chance. Give windows of the later motion, each from an "
                 "observed state, as experiments of their own."
@@ -119,10 +114,9 @@ def fit_staged(
     return replace(result, remarks=tuple(remarks))
 
 
-def _cut(problem: FitProblem, limits: Sequence[float], horizon: float) -> FitProblem:
-    """The problem of the data until a horizon, and the limit of each experiment."""
-    each = zip(problem.experiments, limits, strict=True)
-    cut = tuple(e.until(min(horizon, limit)) for e, limit in each)
+def _until(problem: FitProblem, horizons: Sequence[float]) -> FitProblem:
+    """The problem of the data until a horizon of each experiment [s]."""
+    cut = tuple(e.until(horizon) for e, horizon in zip(problem.experiments, horizons, strict=True))
     return eqx.tree_at(lambda p: p.experiments, problem, cut).with_noise(first_noise(cut))
 
 
@@ -225,13 +219,10 @@ def fit_refined(
     the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and that whole correction is the standard error that
     is left of the discretisation. p is `order`; three grids of equal ratios show it, between half and twice that, but
     the error is no less than by `order`. Where the estimates do not converge, or one is at its bound, the finest stays,
-    its last change the error, with a warning.
-
-    Two estimates may agree by chance, so the error is at least D/2 of those from the noise, D being what the finest
-    grid misses of the data, in units of σ: a discretisation that changes predictions by D in ways that no parameter
-    follows may do as much in ways that one does. D² is what Σ r² loses from the grid before, over r^2p − 1.
-
-    Intervals hold both parts, and keep to the bounds. After Ctrl-C it extrapolates from grids whose fit was done.
+    its last change the error, with a warning. Estimates may agree by chance, so the error is at least D/2 of those from
+    the noise, D being what the finest grid misses of the data, in units of σ: a discretisation may do as much in ways
+    that a parameter follows as in others. D² is what Σ r² loses from the grid before, over r^2p − 1. After Ctrl-C it
+    extrapolates from grids whose fit was done.
 
     Args:
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
@@ -265,9 +256,8 @@ def fit_refined(
     numbers = numbers[: len(fits)]
     if len(fits) < len(refinements):
         warn(f"The fit on several grids was interrupted: of {len(refinements)} grids it tells of {len(fits)}.")
-    missed, remark = 0.0, ""
-    if len(fits) > 1:
-        missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order))
+    missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order)) if len(fits) > 1 else 0.0
+    remark = ""
     if len(fits) > 1 and fits[-1].is_beyond:
         before, after = _squares(fits[-2].noise, fits[-1].noise)
         points, by_noise = (sum(n.points for n in fits[-1].noise if all_of or not n.estimated) for all_of in (1, 0))
@@ -285,8 +275,9 @@ def fit_refined(
     normal = float(quantile(float(level), np.inf))
     extrapolated = (_extrapolate(kind, of, numbers, float(order), missed, normal) for kind, of in each)
     estimates, left, orders = zip(*extrapolated, strict=True)
-    parts = {"from_noise": tuple(e.error for e in fits[-1].all), "from_discretisation": left, "order": orders}
-    return RefinedFit(fits=tuple(fits), refinements=tuple(numbers), estimates=estimates, **parts, remark=remark)
+    by_noise = tuple(e.error for e in fits[-1].all)
+    grids: dict[str, Any] = {"fits": tuple(fits), "refinements": tuple(numbers), "estimates": estimates}
+    return RefinedFit(**grids, from_noise=by_noise, from_discretisation=left, order=orders, remark=remark)
 
 
 def _squares(coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...]) -> tuple[float, float]:

@@ -225,7 +225,7 @@ def _grouped(problem: FitProblem, ends: Ends) -> Ends:
             change = np.asarray(minimum.z - better.z, float)
             r, J = np.asarray(better.seen.residuals, float), np.asarray(better.seen.jacobian, float)
             variance = float((r**2).sum()) / max(np.count_nonzero(r) - len(change), 1)
-            variance = max(variance, 1.0 if all(problem.noise_is_given) else 0.0)
+            variance = max(variance, float(all(o.sigma is not None for o in problem.observations)))
             if (np.abs(change) <= _NEAR).all() or ((J @ change) ** 2).sum() <= len(change) * variance:
                 numbers += points
                 break
