@@ -124,7 +124,7 @@ def iteration(pull: mpm.Experiment, points: np.ndarray, batch: int) -> Callable[
     arrays, rest = zip(*(eqx.partition(s, eqx.is_array) for s in states), strict=True)
     state = eqx.combine(jax.tree.map(lambda *a: np.stack(a), *arrays), rest[0])
     return lambda: eqx.filter(
-        iterate_together(none, problem, optimiser, points[:batch], state),
+        iterate_together(none, problem, optimiser, state),
         eqx.is_array,
     )
 

@@ -228,7 +228,7 @@ def test_a_damaged_log_is_refused(whole, seen, tmp_path):
             _Log(problem, described(problem, method)).read(path, method)
     with h5py.File(path, "w") as file:
         file.attrs["kind"], file.attrs["format"] = np.bytes_("mpmjax fit log"), 1
-    with pytest.raises(ValueError, match=r"is a log of format 1, this mpmjax reads 3: begin the fit anew"):
+    with pytest.raises(ValueError, match=r"is a log of format 1, this mpmjax reads 4: begin the fit anew"):
         fit(seen, PARAMETERS, log=path, resume=True)
 
 

@@ -75,9 +75,8 @@ def run_scene(
 def study_scene(
     path: Path, output: Path, changes: Sequence[str], members: Sequence[Sequence[str]], *, quiet: bool = False
 ) -> None:
-    """Simulate a scene file once for each of some sets of further changes to it, and write a CSV file with a row for
-    each: what changes, the numbers of its last frame (see `table`), and what a run that failed says. All runs are one
-    compiled program."""
+    """Simulate a scene file once for each of some sets of further changes, by one compiled program, and write a CSV
+    file with a row each: what changes, the numbers of the last frame (see `table`), and what a run that failed says."""
 
     def simulation(member: Sequence[str]) -> Simulation:
         return read_simulation(path, [*changes, *member])

@@ -38,9 +38,8 @@ class Kept(eqx.Module):
 
 
 def parts_kept(problem: FitProblem, count: int) -> tuple[Kept, ...] | None:
-    """The parts of the states that the observations of each experiment read; None where the residuals are not those of
-    runs, or these parts do not fit into the memory `count` times, as runs or tangents. Residuals are then one program,
-    in which observations are made during the run."""
+    """The parts of the states that the observations of each experiment read; None where they do not fit into the memory
+    `count` times, as runs or tangents, or residuals are not those of runs: these are then one program."""
     if any(getattr(type(problem), name) is not getattr(FitProblem, name) for name in ("jacobian", "residuals")):
         return None
     kept = _kept(problem)
@@ -162,8 +161,8 @@ def costs_at(
     batch: int,
     progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> Float[np.ndarray, "k"]:
-    """½ Σ r² at many points, without derivatives; NaN where a simulation fails. `batch` are computed together, and
-    `progress` is called with how many are done, and of how many."""
+    """½ Σ r² at many points, `batch` of them together; NaN where a simulation fails. `progress` is called with how many
+    are done, and of how many."""
     costs = np.empty(len(points))
     for first in range(0, len(points), batch):
         r = residuals_at(problem, points[np.minimum(np.arange(first, first + batch), len(points) - 1)])

@@ -47,11 +47,8 @@ class Shown(eqx.Module):
 
 
 class AbstractObservation(eqx.Module):
-    """A measurement of an experiment.
-
-    One of your own says what it needs of each state (`observe`), and what it would have measured in a run of which it
-    has seen all states (`predict`).
-    """
+    """A measurement of an experiment. One of your own says what it needs of each state (`observe`), and what it would
+    have measured in a run of which it has seen all states (`predict`)."""
 
     data: eqx.AbstractVar[np.ndarray]  # the measured numbers, of any shape; NaN where nothing was measured
     name: eqx.AbstractVar[str]  # name in tables and pictures
@@ -69,8 +66,8 @@ class AbstractObservation(eqx.Module):
 
     @abc.abstractmethod
     def predict(self, seen: Any, run: Run) -> Array:
-        """The measurement that a run predicts, in the shape of the data; NaN where the run does not reach. `seen` is
-        what `observe` returned at the start and after each step, with a leading axis."""
+        """The measurement that a run predicts, in the shape of the data, NaN where it does not reach, from what
+        `observe` returned at the start and after each step, with a leading axis."""
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         """Raise a `ValueError` if the data do not fit this scene and these prepared particles, until t1 [s]."""
@@ -258,8 +255,8 @@ class Experiment(eqx.Module):
         return number_of_steps(self.t1, self.dt, 0, self.dtype)
 
     def until(self, t1: float) -> "Experiment":
-        """The experiment, ended at the first step from a time [s] on, with the data until then; itself where there are
-        none, or the time is not before its end. Observations without times, such as a `Curve`, are left out."""
+        """The experiment, ended at the first step from a time [s] on, with the data until then, of what has times;
+        itself where there are none, or the time is not before its end."""
         parts = [o.part_until(t1) for o in self.observations]
         kept = tuple(part for part in parts if part is not None)
         steps = int(np.ceil(t1 / self.dt - _ON_A_STEP))

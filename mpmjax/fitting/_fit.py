@@ -60,32 +60,30 @@ def fit(
 
     The least sum of squares of (simulated − measured)/σ over all observations is searched, with derivatives through
     every step and every implicit solve. A σ that is not given is estimated as √(Σ r²/(m − n)), of several observations
-    in rounds. Errors and intervals hold a misfit beyond the noise, those of the noise alone beside them
-    (docs/fitting.md#intervals-that-hold). Ctrl-C ends a fit after the iteration in progress: the best so far is
-    returned, not converged.
+    in rounds. Errors and intervals hold a misfit beyond the noise (docs/fitting.md#intervals-that-hold). Ctrl-C ends a
+    fit after the iteration in progress: the best so far is returned, not converged.
 
     Args:
         experiments: one or several, which share the parameters.
         parameters: what is fitted, by name.
-        starts: from how many points it is searched, or which (`Starts`). "auto": where the misfit of the first search
-            is beyond the noise, 24 more points are looked at, and some searched from, until a misfit is within it;
-            `result.screening` has what they found. 1 searches from the first guess alone.
+        starts: from how many points it is searched, or which (`Starts`), 1 from the first guess alone. "auto": where
+            the misfit of the first search is beyond the noise, 24 more points are looked at, and some searched from,
+            until a misfit is within it (`result.screening`).
         discretisation: whether to look at twice the spacing, and at twice the step there, by three runs each at most,
-            and count as errors how far the minimum moves. What parameters make up for leaves no misfit that tells.
+            and count as errors how far the minimum moves.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
-        optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, with few
-            parameters or few measured numbers, else `LBFGS`.
+        optimiser: the method of the search. Default: `LevenbergMarquardt` with few parameters or few measured numbers,
+            else `LBFGS`.
         memory: for what reverse mode stores, and for the tangents of forward mode that are made at once [B].
         progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`.
-        log: an HDF5 file that holds each iteration (docs/fitting.md) but the one in progress, whatever ends the fit: of
-            the first search, and of the last one from another start.
+        log: an HDF5 file (docs/fitting.md) that holds each iteration that is done, whatever ends the fit: of the first
+            search, and of the last one from another start.
         resume: continue the fit of the log, bit for bit. Only the optimiser's `max_steps` may differ.
 
     Raises:
         ValueError: a parameter that is no number of the experiment, lies outside its bounds or does not influence the
-            data; too few data; data that the simulation does not reach; a log that is there already or, with `resume`,
-            is not, or is of another fit.
+            data; too few data, or data not reached; a log that is there already, with `resume` none or another fit's.
         SimulationError: the simulation at the first guess meets a fault.
         RuntimeError: there is no derivative.
         OSError: the disk refused the log, which holds what it held before.
@@ -146,8 +144,7 @@ def fit(
 
 
 def _see(problem: FitProblem, seen: Evaluation, alike: set[str], say: Callable[[str], None]) -> None:
-    """Refuse parameters that the data do not see at the first guess; warn, once, of those that they see together alone,
-    whose names are added to those `alike`."""
+    """Refuse parameters that the data do not see at the first guess; warn, once, of those not seen apart, `alike`."""
     require_influence(problem, seen)
     if seen.jacobian is None or alike:
         return
@@ -160,7 +157,7 @@ def _see(problem: FitProblem, seen: Evaluation, alike: set[str], say: Callable[[
 
 def _warn_of(result: FitResult, end: Search, *, moves: bool, but: set[str]) -> None:
     """Warn of a search that has not converged, or whose noise still `moves` it, and of what the result says, `but` of
-    parameters that were named at the first guess."""
+    those named at the first guess."""
     if not result.converged:
         stopped = "was interrupted" if result.interrupted else "did not converge"
         advice = " Raise max_steps, start closer, or give a rtol that the precision can reach."
@@ -176,8 +173,7 @@ def _warn_of(result: FitResult, end: Search, *, moves: bool, but: set[str]) -> N
 
 
 def chosen_optimiser(problem: FitProblem) -> AbstractOptimiser:
-    """Levenberg-Marquardt while its Jacobian is cheap, with few parameters or measured numbers; else L-BFGS, with more
-    iterations of the same cost for any number of parameters (docs/fitting.md has the measurement)."""
+    """Levenberg-Marquardt while its Jacobian is cheap, else L-BFGS (docs/fitting.md has the measurement)."""
     columns = min(problem.size, ROW_COST * problem.measured)
     return LevenbergMarquardt() if columns <= MOST_COLUMNS else LBFGS()
 
@@ -191,8 +187,8 @@ def _in_rounds(
     state: Search | None = None,
     **options: Any,
 ) -> list[Minimum]:
-    """Searches of each problem, again and again until the noise that it leaves is the noise it was made with, with the
-    iterations of all. `state` and `options` as of `search_many`, after so many `rounds`."""
+    """Searches of each problem until the noise that one leaves is the noise it was made with, with the iterations of
+    all. `state` and `options` as of `search_many`, after so many `rounds`."""
     histories: list[tuple[Iteration, ...]] = [()] * len(problems)
     minima, places = dict[int, Minimum](), dict(enumerate(starts))
     while places:
@@ -267,9 +263,9 @@ class EnsembleFit(eqx.Module):
 
     @property
     def alike(self) -> np.ndarray:
-        """Probability of so large a spread of each number if all data sets had one value and the errors are right:
-        Cochran's Q = Σ (z_k − z̄)²/s_k² of the values, of logarithms where none is at zero, χ² of k − 1 degrees of
-        freedom (W. G. Cochran, Biometrics 10 (1954) 101, doi 10.2307/3001666), shape (n,)."""
+        """Probability of so large a spread of each number if all data sets had one value, shape (n,): Cochran's
+        Q = Σ (z_k − z̄)²/s_k² of values, or logarithms, as χ² of k − 1 degrees of freedom (W. G. Cochran, Biometrics 10
+        (1954) 101, doi 10.2307/3001666)."""
         z, s, held = self._columns
         if len(z) < 2:
             return np.full(z.shape[1], np.nan)
@@ -359,7 +355,6 @@ def fit_ensemble(
     return EnsembleFit(tuple(fits), failures)
 
 
-MOST_COLUMNS = 32
-"""Columns of a Jacobian, or rows at what they cost more, up to which Levenberg-Marquardt is the cheaper."""
+MOST_COLUMNS = 32  # of a Jacobian, or rows at what they cost more, up to which Levenberg-Marquardt is the cheaper
 MOST_ROUNDS = 20  # most re-estimations of the noise
 _ROUNDINGS = 10  # derivatives by a coordinate below so many roundings of the data are none

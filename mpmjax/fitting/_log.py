@@ -32,13 +32,12 @@ from mpmjax.fitting._problem import SHOWN, FitProblem
 from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
 from mpmjax.io import ReplacedFile, check_hdf5, reason, reporting
 
-_FORMAT = 3
+_FORMAT = 4
 _ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), ("accepted", "?"), ("seconds", "f8")]
 _MOST = 8  # numbers of an array that are written out
 _FREE = ("optimiser.max_steps",)  # choices that may differ in a fit that is continued: it may go on for longer
 
-Past = tuple[int, tuple[Iteration, ...], FitProblem, Search]
-"""Number of rounds before the last one, and their iterations; the problem with its noise, and its search."""
+Past = tuple[int, tuple[Iteration, ...], FitProblem, Search]  # rounds before the last, their iterations; the last one
 
 
 @contextmanager
@@ -50,7 +49,7 @@ def recorded(
     *,
     resume: bool,
 ) -> Iterator[tuple[Past | None, Callable[[FitProblem, Search], None]]]:
-    """The past of a fit that a log holds, if it is to `resume`, and a function that records a search of the problem,
+    """The past of a fit that a log holds, if it is to `resume`, and a function that records a search, of the problem
     with the noise of its round, after each iteration: in the log at this path, by lines of progress, or both."""
     log, past = _Log(problem, {} if path is None else described(problem, optimiser)), None
     with ExitStack() as stack:
@@ -250,13 +249,9 @@ def _digest(data: bytes) -> str:
 def _lines(
     problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None], done: int
 ) -> Callable[[Search, float], None]:
-    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left of the present search.
-    The first one says that an iteration is compiled; `done` are in the log.
-
-    The time left is the median time of an iteration times how many are left: about so many as the optimiser's distance
-    from converged needs to fall to one, where it falls; else at most those up to `max_steps`. It is not said while only
-    the iteration that was compiled is timed, and at the end.
-    """
+    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left of the present search,
+    after a first one that an iteration is compiled; `done` are in the log. The time left is the median time of an
+    iteration times how many the optimiser's distance from converged needs to fall to one, or all up to `max_steps`."""
     durations, distances, last = list[float](), list[float](), time.perf_counter()
     labels = ", ".join(problem.labels[:SHOWN]) + (", …" if problem.size > SHOWN else "")
     after = f" after {done} iterations of the log" if done else ""

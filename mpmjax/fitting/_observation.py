@@ -96,8 +96,8 @@ class AbstractTimed(AbstractObservation):
         return "time [s]", self.times
 
     def predict(self, seen: Any, run: Run, first: Scalar = 0.0) -> Array:
-        """Values at the times, from those `seen` of all steps, shape (k, ...), the first of which is `first` steps from
-        the start; NaN at times that a parameter has moved out of the run."""
+        """Values at the times, from those of all steps, shape (k, ...), from step `first` on; NaN at times that a
+        parameter has moved out of the run."""
         step = jnp.asarray(self.times, seen.dtype) / run.dt
         outside = (step < -_BEYOND) | (step > (len(run.steps) - 1) * (1 + ROUNDED) + _BEYOND)
         outside = outside.reshape(-1, *[1] * (seen.ndim - 1))
@@ -191,9 +191,8 @@ class Tracks(AbstractTimed):
 
 
 class Force(AbstractTimed):
-    """The force on a collider, such as a plate on which a body falls, or on any boundary, against time.
-
-    Compared with the force of each step at its own time (see `Forces`), interpolated linearly.
+    """The force on a collider, such as a plate on which a body falls, or on any boundary, against time: compared with
+    that of each step at its own time (see `Forces`), interpolated linearly.
 
     Args:
         times: when it was measured [s], shape (f,), growing.

@@ -87,11 +87,9 @@ class Gaussian(AbstractPrior):
 
 
 class Smooth(AbstractPrior):
-    """Prior knowledge of a field: neighbours differ little, by a normal distribution of mean zero.
-
-    Neighbours are entries next to each other along an axis of the parameter, which is an array: the nodes of a `Field`,
-    or a history in time. The difference is that of logarithms of a `Positive` parameter, of logits of a `Bounded` one,
-    of values of an `Unbounded` one. The mean level is left free.
+    """Prior knowledge of a field: neighbours along its axes, nodes of a `Field` or times of a history, differ little by
+    a normal distribution of mean zero: logarithms of a `Positive` parameter, logits of a `Bounded` one, values of an
+    `Unbounded` one. The mean level is left free.
 
     Args:
         sigma: standard deviation of the difference of two neighbours, 0.1 of a `Positive` parameter for about 10 %. On
@@ -184,8 +182,8 @@ class AbstractParameter(eqx.Module):
         """Raise a `ValueError` if it cannot be put into an experiment."""
 
     def room(self, start: Value, z: Value) -> tuple[Value, Value]:
-        """How far the value can fall and rise until its bounds, each over its derivative by z [-], of the value's
-        shape: after so many units of z a straight line in the value meets the bound."""
+        """How far the value can fall and rise until its bounds, each over its derivative by z [-], in its shape: the
+        units of z after which a straight line in the value meets the bound."""
         return jnp.full_like(z, jnp.inf), jnp.full_like(z, jnp.inf)
 
     def prior_residuals(self, value: Value) -> Array:

@@ -88,8 +88,8 @@ class FitProblem(eqx.Module):
         return eqx.tree_at(lambda p: p.sigmas, self, sigmas)
 
     def on_plane(self, origin: np.ndarray, basis: np.ndarray) -> "FitProblem":
-        """The problem on a plane of its coordinates, origin + basis y, shapes (n,) and (n, f), as a function of y: one
-        program for all planes of as many dimensions, spanned by some of the coordinates."""
+        """The problem as a function of y on a plane of its coordinates, origin + basis y, shapes (n,) and (n, f), which
+        some of them span: one program for all planes of as many dimensions."""
         plane = jnp.asarray(origin, self.dtype), jnp.asarray(basis, self.dtype)
         return eqx.tree_at(lambda p: p.plane, self, plane, is_leaf=lambda leaf: leaf is None)
 
@@ -207,8 +207,8 @@ class FitProblem(eqx.Module):
 
     def residuals(self, z: Coordinates, adjoint: Any) -> tuple[Array, Array]:
         """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does
-        not reach a measurement; and the reports of tangent solves (`Run.report`). `adjoint` is how diffrax
-        differentiates, None reverse mode within the memory."""
+        not reach; and the reports of tangent solves (`Run.report`). `adjoint` is diffrax's, None for reverse mode
+        within the memory."""
         parts, reports, noise = [], [], iter(self.sigmas)
         for experiment in self.at(z):
             run = experiment.run(adjoint=adjoint, throw=False, checkpoint_bytes=self.memory)
@@ -224,8 +224,8 @@ class FitProblem(eqx.Module):
         return jnp.concatenate([parameter.prior_residuals(value) for parameter, value in each])
 
     def gradient(self, z: Coordinates) -> tuple[Array, Array, Coordinates]:
-        """The residuals r, ½ Σ r² and its derivative by the coordinates, by one pass of reverse mode, whatever their
-        number. NaN where a simulation met a fault, the derivative also where an adjoint solve did not converge."""
+        """The residuals r, ½ Σ r² and its derivative by the coordinates, by one pass of reverse mode. NaN where a
+        simulation met a fault, the derivative also where an adjoint solve did not converge."""
 
         def cost(z: Coordinates) -> tuple[Array, Array]:
             r = self.residuals(z.astype(self.dtype), None)[0].astype(z.dtype)
@@ -245,9 +245,9 @@ class FitProblem(eqx.Module):
         raise ValueError(failure)
 
     def jacobian(self, z: Coordinates, mode: Literal["forward", "reverse"] | None = None) -> tuple[Array, Array]:
-        """The residuals and their derivative by the coordinates, shape (m, n). NaN where a tangent or adjoint solve did
-        not converge. The mode is "forward", a tangent of each coordinate beside the simulation, or "reverse", a pass
-        back for each measured number, as many at once as the memory holds; default: the cheaper one."""
+        """The residuals and their derivative by the coordinates, shape (m, n), NaN where a tangent or adjoint solve did
+        not converge: "forward", by a tangent of each coordinate beside the simulation, or in "reverse", by a pass back
+        for each measured number, as many at once as the memory holds; default: the cheaper one."""
         if (self.cheaper_mode if mode is None else mode) == "reverse":
             r, pull, _ = jax.vjp(lambda z: self.residuals(z, None), z, has_aux=True)
             units = np.eye(self.measured, len(r), dtype=r.dtype)  # priors need no simulation
@@ -307,8 +307,8 @@ def linearised(function: Callable[[Coordinates], Any], z: Coordinates, at_once: 
 
 
 def in_batches(function: Callable[[Any], tuple[Any, Any]], units: Any, at_once: int) -> tuple[Any, Any]:
-    """A function of each row of `units`, arrays (k, ...), by batches of `at_once` rows. It returns two pytrees: one
-    that all rows share, and one of each row, which gets a leading axis k."""
+    """A function of each row of `units`, arrays (k, ...), by batches of `at_once`: it returns a pytree that all rows
+    share, and one of each row, which gets a leading axis k."""
     count = len(jax.tree.leaves(units)[0])
     batches = -(-count // at_once)
     size = -(-count // batches)
@@ -331,6 +331,5 @@ def in_batches(function: Callable[[Any], tuple[Any, Any]], units: Any, at_once: 
 
 
 SHOWN = 4  # parameters that a line has room for
-ROW_COST = 1.2
-"""Cost of a row of the Jacobian by reverse mode, over that of a column by forward mode (benchmarks/fit_cost.py)."""
+ROW_COST = 1.2  # of the Jacobian by reverse mode, over that of a column by forward mode (benchmarks/fit_cost.py)
 _COPIES = 16  # memory that a tangent takes, in sizes of the particles' (benchmarks/fit_cost.py)

@@ -61,11 +61,9 @@ class FitResult(AbstractFit):
     optimiser: AbstractOptimiser  # the method of the search
     converged: bool  # whether the search met its tolerance
     history: tuple[Iteration, ...]  # the iterations of the search
-    warnings: tuple[str, ...]
-    """Directions that the data do not see, and a misfit that the noise does not explain, in words."""
+    warnings: tuple[str, ...]  # directions that the data do not see, and a misfit beyond the noise, in words
     interrupted: bool = False  # whether Ctrl-C ended it
-    moved: np.ndarray | str | None = None
-    """How far z moves on twice the spacing, then with twice the step, shape (2, n); or why that is not known."""
+    moved: np.ndarray | str | None = None  # how far z moves on twice the spacing, then step, shape (2, n); or why not
     screening: Screening | None = None  # the other points from which the minimum was searched, if it was
     remarks: tuple[str, ...] = ()  # how its start was come by, in words
 
@@ -86,7 +84,7 @@ class FitResult(AbstractFit):
     @property
     def fitted(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """The fit's value of each observation where it was measured, NaN elsewhere, in the shape and unit of its
-        data, and its derivative by the coordinates, shape (..., n): both follow from the residuals."""
+        data, and its derivative by the coordinates, shape (..., n), from the residuals."""
         values, derivatives = [], []
         observations = [o for e in self.experiments for o in e.observations]
         for o, sigma, rows in zip(observations, self.problem.sigmas, self.problem.rows, strict=True):
@@ -195,8 +193,8 @@ class FitResult(AbstractFit):
 
 
 Noise = list[tuple[Array, float, float]]
-"""The noise of each observation, in its data's unit, by the residuals at a minimum; the factor by which it is larger
-than it was in the search; and the degrees of freedom of the estimate, zero where the noise is given."""
+"""The noise of each observation, in its data's unit, by how much it is larger than in the search, and the degrees of
+freedom of the estimate, zero where it is given."""
 Both = tuple[Uncertainty, Uncertainty]  # by the noise and what the misfit shows, and by the noise alone
 
 
@@ -309,8 +307,8 @@ def fit_result(
 def _judged(
     problem: FitProblem, k: int, settled: Noise, r: np.ndarray, J: np.ndarray, rest: np.ndarray
 ) -> tuple[NoiseEstimate, tuple[slice, float, float], tuple[slice, float, float]]:
-    """The noise of observation k by residuals r, of which twice the spacing leaves the `rest` unexplained, and what
-    `uncertainty` takes of it: by the noise alone, and by what the misfit shows."""
+    """The noise of observation k by residuals r, of which twice the spacing leaves the `rest`, and what `uncertainty`
+    takes of it: by the noise alone, and by what the misfit shows."""
     observation, rows, is_given = problem.observations[k], problem.rows[k], problem.observations[k].sigma is not None
     (sigma, _, freedom), weight, count = settled[k], observation.trust[0], observation.count
     size, squares = float(np.sqrt((np.asarray(sigma) ** 2).mean())), (r[rows] ** 2).sum()
@@ -373,10 +371,9 @@ def intervals(
     """Lower and upper ends of the fitted numbers' intervals, each of shape (n,).
 
     They are where Δχ² = 2 g δ + δ²/s² reaches its threshold q², δ of the coordinate, s the standard error and g the
-    gradient, zero but of what a bound holds. Beside a bound, at three times the reach or nearer, data that follow the
-    value would be missed too often: there each end is the farther of two, of the coordinate and of a straight line in
-    the value. Where that line meets the bound, it alone makes the interval, which ends there: the coordinate never
-    comes to a bound.
+    gradient, zero but of what a bound holds. Beside a bound, at three times the reach or nearer, each end is the
+    farther of two, of the coordinate and of a straight line in the value, or the truth would be missed too often. Where
+    that line meets the bound, it alone makes the interval, which ends there.
     """
     error, freedom = errors.of(np.eye(problem.size))
     q = quantile(level, freedom)
@@ -405,8 +402,7 @@ _SHAPES = {
 }
 _EXACT = 1e-6  # misfit, in sizes of the data, below which data are exact
 _ROUNDINGS = 100  # the same in roundings
-_LEAST_FREEDOM = 4.0
-"""Degrees of freedom of a misfit, at least: the factor errs to the safe side, and fewer would widen intervals more."""
+_LEAST_FREEDOM = 4.0  # of a misfit: the factor errs to the safe side, and fewer would widen intervals more
 _BESIDE = 3  # reaches of an interval within which it is beside a bound
 _NOISE_RTOL = 1e-3  # the noise of several observations is settled when its estimate changes less, relatively
 _LEAST = 1e-12  # smallest noise, in sizes of the data: exact data have none

@@ -167,8 +167,7 @@ class RefinedFit(AbstractFit):
 
     fits: tuple[FitResult, ...]  # the fit on each grid, from coarse to fine
     refinements: tuple[int, ...]  # the spacing of the scene over that of each fit
-    estimates: tuple[Estimate, ...]
-    """The extrapolated numbers. Error and interval hold the noise's and the discretisation's part."""
+    estimates: tuple[Estimate, ...]  # the extrapolated numbers, with errors of the noise and of the discretisation
     from_noise: tuple[float, ...]  # the part of each error that the data's noise makes
     from_discretisation: tuple[float, ...]  # the part that is left of the discretisation
     order: tuple[float, ...]  # the order in the spacing with which each was extrapolated; NaN of what does not converge
@@ -289,8 +288,7 @@ def _squares(coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...])
 def _missed(
     coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...], refinements: list[int], order: float
 ) -> float:
-    """D, by how much the finest grid misses the data beyond their noise, in units of its σ: by what the sum of squares
-    lost since the grid before, as the square of what falls with the spacing to the power of the order."""
+    """D of `fit_refined`, by how much the finest grid misses the data beyond their noise, in units of its σ."""
     before, after = _squares(coarse, fine)
     return float(np.sqrt(max(before - after, 0.0) / ((refinements[-1] / refinements[-2]) ** (2 * order) - 1)))
 
@@ -303,9 +301,9 @@ def _extrapolate(
     missed: float,
     normal: float,
 ) -> tuple[Estimate, float, float]:
-    """One number extrapolated from its estimates on the grids, from coarse to fine; the part of its error that is left
-    of the discretisation; and the order, NaN where the estimates do not converge. `kind` is its parameter, None if it
-    was reported; `missed` as of `_missed`; `normal` the reach of a normal interval, in standard errors."""
+    """One number of a parameter (None if reported) extrapolated from its estimates from coarse to fine; the part of its
+    error that is left of the discretisation; and the order, NaN where the estimates do not converge. `missed` as of
+    `_missed`; `normal` the reach of a normal interval, in standard errors."""
     last = estimates[-1]
     if len(estimates) == 1:
         return last, float("nan"), float("nan")
