@@ -95,21 +95,6 @@ class Columns:
         )
         return self._data[name] * unit
 
-    def times(self, name: str, unit: float, t1: float, *, grow: bool = True) -> np.ndarray:
-        """The times [s] of a column, which must lie in a run until t1 [s] and, with `grow`, grow from row to row."""
-        times = self.scaled(name, unit, "time_unit")
-        read, advice = (f", with time_unit = {unit:g},", "") if unit != 1 else ("", ", or give time_unit")
-        self.require(times >= 0, f"{name} {{{name}}} lies before the run, which begins at 0: leave the row out.")
-        self.require(
-            ~after(times, t1),
-            f"{name} {{{name}}}{read} lies after the end of the run, t1 = {t1:g} s: raise [run] t1, leave the row out"
-            f"{advice}.",
-        )
-        if grow:
-            steps = np.diff(times, prepend=-np.inf)
-            self.require(steps > 0, f"{name} {{{name}}} must be later than in the row before: sort the rows by time.")
-        return times
-
 
 def after(times: np.ndarray, t1: float) -> np.ndarray:
     """Whether times lie after a run's end t1 [s], by more than single precision has rounded the times of its steps."""

@@ -325,8 +325,7 @@ def fit_ensemble(
     Args:
         experiments: the data sets: an experiment each, or several each that share the parameters. They may differ in
             every number, and in no shape, choice or function: give a marker that was not seen as NaN.
-        batch: how many searches run together, see `Starts`.
-        progress: called with a line, such as `print`, as searches end.
+        batch, progress: how many searches run together, see `Starts`; called with a line as they end.
         parameters, report, level, optimiser: see `fit`.
 
     Raises:

@@ -248,9 +248,7 @@ def _stacked(trees: Sequence[Any]) -> tuple[Any, Any]:
 def batch_size(problem: FitProblem, batch: int | None, count: int) -> int:
     """How many of `count` points or searches to compute together. Default: eight with explicit steps, and one with
     implicit ones, where all wait for the slowest solve (`benchmarks/multistart.py`)."""
-    if batch is not None:
-        return min(batch, count)
-    return min(8 if all(e.method.is_explicit for e in problem.experiments) else 1, count)
+    return min(batch or (8 if all(e.method.is_explicit for e in problem.experiments) else 1), count)
 
 
 def counted(progress: Callable[[str], None] | None, text: str) -> Callable[[int, int], None]:

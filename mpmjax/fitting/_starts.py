@@ -90,16 +90,10 @@ class Screening(eqx.Module):
 
     def __str__(self) -> str:
         """A table of the minima."""
-        minima, count = self.minima[:_SHOWN], len(next(iter(self.points.values())))
-        rows = [
-            (
-                f"{len(m.members):>24}",
-                f"{m.searches:>8}",
-                f"{m.misfit:>10.4g}",
-                *(f"{value.reshape(-1)[0]:>13.6g}" for value in list(m.values.values())[:SHOWN]),
-            )
-            for m in minima
-        ]
+        count, rows = len(next(iter(self.points.values()))), []
+        for m in self.minima[:_SHOWN]:
+            values = (f"{value.reshape(-1)[0]:>13.6g}" for value in list(m.values.values())[:SHOWN])
+            rows.append((f"{len(m.members):>24}", f"{m.searches:>8}", f"{m.misfit:>10.4g}", *values))
         labels = [f"{name if v.ndim == 1 else f'{name}, first':>13}" for name, v in self.points.items()][:SHOWN]
         lines = [f"{count} points, {len(self.searched)} searches, {self.iterations} iterations"]
         lines += table((f"{'points':>24}", "searches", f"{'misfit/σ':>10}", *labels), *rows)
