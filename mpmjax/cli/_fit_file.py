@@ -219,8 +219,7 @@ _OF_THE_BODY = ("Velocity", "Spin")  # parameters of the initial motion of all p
 
 
 def _of_the_body(kind: str, where: str, experiment: Experiment, common: dict[str, Any]) -> Unbounded:
-    """The velocity of the centre of mass at the start [m/s], d numbers; or the rate at which the body turns about it
-    besides [rad/s], one number or three."""
+    """The velocity of the centre of mass at the start [m/s], or a rate of turning about it besides [rad/s]."""
     particles = experiment.particles
     d = particles.dim
     if kind == "Velocity":

@@ -16,16 +16,15 @@ from mpmjax.fitting._uncertainty import uncertainty
 class CoarseGrid(NamedTuple):
     """The look at twice the spacing, and at twice the step there."""
 
-    moved: Float[np.ndarray, "2 n"]
-    """How far the minimum moves on twice the spacing, and from there with twice the step: two numbers, because errors
-    of spacing and step often have opposite signs."""
+    moved: Float[
+        np.ndarray, "2 n"
+    ]  # how far the minimum moves on twice the spacing, and from there with twice the step
     residuals: Float[np.ndarray, "m"]  # those of the minimum on twice the spacing
 
 
 def look_at_coarse_grid(problem: FitProblem, z: Coordinates, jacobian: Float[np.ndarray, "m n"]) -> CoarseGrid | str:
     """The look at twice the spacing from the minimum z, or why there is none: by Gauss-Newton steps −(JᵀJ)⁻¹ Jᵀ r with
-    the residuals r of the coarse grid and the Jacobian of the fine one, three at most of each, while they lower Σ r².
-    What a bound holds has no column in the Jacobian."""
+    r of the coarse grid and J of the fine one, zero of what a bound holds, at most three of each, while Σ r² falls."""
     inverse = uncertainty(jacobian, float(jnp.finfo(problem.dtype).eps), ()).inverse
     places, first = [np.asarray(z, float)], None
     for longer in (1, 2):

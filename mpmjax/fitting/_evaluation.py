@@ -161,8 +161,7 @@ def costs_at(
     batch: int,
     progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> Float[np.ndarray, "k"]:
-    """½ Σ r² at many points, `batch` of them together; NaN where a simulation fails. `progress` is called with how many
-    are done, and of how many."""
+    """½ Σ r² at many points, `batch` of them together; NaN where a simulation fails. `progress` as of `search_many`."""
     costs = np.empty(len(points))
     for first in range(0, len(points), batch):
         r = residuals_at(problem, points[np.minimum(np.arange(first, first + batch), len(points) - 1)])

@@ -255,8 +255,7 @@ class Experiment(eqx.Module):
         return number_of_steps(self.t1, self.dt, 0, self.dtype)
 
     def until(self, t1: float) -> "Experiment":
-        """The experiment, ended at the first step from a time [s] on, with the data until then, of what has times;
-        itself where there are none, or the time is not before its end."""
+        """The experiment until the first step from a time [s] on, with the data that have times; itself without any."""
         parts = [o.part_until(t1) for o in self.observations]
         kept = tuple(part for part in parts if part is not None)
         steps = int(np.ceil(t1 / self.dt - _ON_A_STEP))

@@ -156,8 +156,7 @@ def _see(problem: FitProblem, seen: Evaluation, alike: set[str], say: Callable[[
 
 
 def _warn_of(result: FitResult, end: Search, *, moves: bool, but: set[str]) -> None:
-    """Warn of a search that has not converged, or whose noise still `moves` it, and of what the result says, `but` of
-    those named at the first guess."""
+    """Warn of a search that did not converge, or whose noise `moves` it, and of what the result says `but` that."""
     if not result.converged:
         stopped = "was interrupted" if result.interrupted else "did not converge"
         advice = " Raise max_steps, start closer, or give a rtol that the precision can reach."
@@ -187,8 +186,7 @@ def _in_rounds(
     state: Search | None = None,
     **options: Any,
 ) -> list[Minimum]:
-    """Searches of each problem until the noise that one leaves is the noise it was made with, with the iterations of
-    all. `state` and `options` as of `search_many`, after so many `rounds`."""
+    """Searches of each problem, as of `search_many`, until one leaves the noise that it was made with."""
     histories: list[tuple[Iteration, ...]] = [()] * len(problems)
     minima, places = dict[int, Minimum](), dict(enumerate(starts))
     while places:

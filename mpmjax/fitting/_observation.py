@@ -96,8 +96,7 @@ class AbstractTimed(AbstractObservation):
         return "time [s]", self.times
 
     def predict(self, seen: Any, run: Run, first: Scalar = 0.0) -> Array:
-        """Values at the times, from those of all steps, shape (k, ...), from step `first` on; NaN at times that a
-        parameter has moved out of the run."""
+        """Values at the times, from those of steps, shape (k, ...), from `first` on; NaN where a time left the run."""
         step = jnp.asarray(self.times, seen.dtype) / run.dt
         outside = (step < -_BEYOND) | (step > (len(run.steps) - 1) * (1 + ROUNDED) + _BEYOND)
         outside = outside.reshape(-1, *[1] * (seen.ndim - 1))

@@ -1,5 +1,4 @@
-"""Methods that search the least sum of squares: Levenberg-Marquardt by residuals and their Jacobian, L-BFGS and Adam of
-optax by the gradient alone."""
+"""Methods that search the least Σ r²: Levenberg-Marquardt by the Jacobian, L-BFGS and Adam of optax by the gradient."""
 
 from collections.abc import Callable
 from functools import partial
@@ -145,8 +144,8 @@ class _Lines(NamedTuple):
         return ((self.r + self.J @ step) ** 2).sum()
 
     def gauss_newton(self) -> tuple[np.ndarray, np.ndarray]:
-        """The next Gauss-Newton step, were values straight lines in their coordinates up to their bounds, NaN if not
-        known, and which coordinates it brings to a bound."""
+        """The Gauss-Newton step of values that are straight lines up to their bounds, NaN if not known, and which are
+        brought to one."""
         r, J, room = self
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
             return np.full(J.shape[1], np.nan), np.zeros(J.shape[1], bool)

@@ -39,8 +39,7 @@ class AbstractPrior(eqx.Module):
 
     @abc.abstractmethod
     def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
-        """The residuals [-], shape (k,), of the value in its unit and, of the same shape, in a measure without bounds
-        (see `AbstractParameter.free`)."""
+        """The residuals [-], shape (k,), of the value in its unit and, in its shape, `AbstractParameter.free` of it."""
 
     @abc.abstractmethod
     def check(self, name: str, shape: tuple[int, ...]) -> None:
@@ -182,8 +181,7 @@ class AbstractParameter(eqx.Module):
         """Raise a `ValueError` if it cannot be put into an experiment."""
 
     def room(self, start: Value, z: Value) -> tuple[Value, Value]:
-        """How far the value can fall and rise until its bounds, each over its derivative by z [-], in its shape: the
-        units of z after which a straight line in the value meets the bound."""
+        """How far the value can fall and rise until its bounds, each over its derivative by z [-], in its shape."""
         return jnp.full_like(z, jnp.inf), jnp.full_like(z, jnp.inf)
 
     def prior_residuals(self, value: Value) -> Array:

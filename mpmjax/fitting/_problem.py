@@ -88,8 +88,7 @@ class FitProblem(eqx.Module):
         return eqx.tree_at(lambda p: p.sigmas, self, sigmas)
 
     def on_plane(self, origin: np.ndarray, basis: np.ndarray) -> "FitProblem":
-        """The problem as a function of y on a plane of its coordinates, origin + basis y, shapes (n,) and (n, f), which
-        some of them span: one program for all planes of as many dimensions."""
+        """The problem as a function of y on a plane of some coordinates, origin + basis y, shapes (n,) and (n, f)."""
         plane = jnp.asarray(origin, self.dtype), jnp.asarray(basis, self.dtype)
         return eqx.tree_at(lambda p: p.plane, self, plane, is_leaf=lambda leaf: leaf is None)
 
@@ -206,9 +205,8 @@ class FitProblem(eqx.Module):
         return eqx.tree_at(lambda e: e.particles.C, experiment, now.C + change)
 
     def residuals(self, z: Coordinates, adjoint: Any) -> tuple[Array, Array]:
-        """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does
-        not reach; and the reports of tangent solves (`Run.report`). `adjoint` is diffrax's, None for reverse mode
-        within the memory."""
+        """The residuals of all observations, then of priors [-], shape (m,), NaN where a run met a fault or does not
+        reach; and its reports of tangent solves. `adjoint` is diffrax's, None for reverse mode within the memory."""
         parts, reports, noise = [], [], iter(self.sigmas)
         for experiment in self.at(z):
             run = experiment.run(adjoint=adjoint, throw=False, checkpoint_bytes=self.memory)
@@ -307,8 +305,7 @@ def linearised(function: Callable[[Coordinates], Any], z: Coordinates, at_once: 
 
 
 def in_batches(function: Callable[[Any], tuple[Any, Any]], units: Any, at_once: int) -> tuple[Any, Any]:
-    """A function of each row of `units`, arrays (k, ...), by batches of `at_once`: it returns a pytree that all rows
-    share, and one of each row, which gets a leading axis k."""
+    """A function of each row of `units`, arrays (k, ...), `at_once` together: what all share, and of each, (k, ...)."""
     count = len(jax.tree.leaves(units)[0])
     batches = -(-count // at_once)
     size = -(-count // batches)

@@ -203,8 +203,7 @@ class _Path:
         return self.visited[-1]
 
     def open_end(self, side: int, last: _Point, reach: float, fault: float) -> float:
-        """The infinite end of an interval whose last point is below the threshold; `fault` is where the simulation
-        fails beyond, infinite if it does not."""
+        """The infinite end of an interval, below the threshold at its last point, and before a `fault`, if finite."""
         beyond = f" Beyond, at {self.value(fault):.5g}, the simulation fails." if np.isfinite(fault) else ""
         self.remarks.append(
             f"the interval is open {_SIDES[side]}. At {self.numbers(last[0])[self.at]:.5g} Δχ² is "

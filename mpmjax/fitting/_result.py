@@ -151,8 +151,7 @@ class FitResult(AbstractFit):
 
     @property
     def p_value(self) -> float:
-        """The probability of so large a χ² if the model and the noise given are right; NaN if noise was estimated, or
-        an observation is robust or weighted."""
+        """The probability of so large a χ² by the noise given alone; NaN if any is estimated, robust or weighted."""
         plain = all(o.trust == (1.0, None) for e in self.experiments for o in e.observations)
         if not plain or any(noise.estimated for noise in self.noise) or self.degrees_of_freedom < 1:
             return np.nan

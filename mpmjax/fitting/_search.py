@@ -217,8 +217,7 @@ def _iterated(
 
 
 def _stacked(trees: Sequence[Any]) -> tuple[Any, Any]:
-    """Trees that differ in numbers alone as one with the leaves that differ, stacked, shape (k, ...), and one with the
-    others, which are stored once."""
+    """Trees that differ in numbers alone as one with what differs, stacked, shape (k, ...), and one with the others."""
     leaves, structures = zip(*(jax.tree.flatten(tree) for tree in trees), strict=True)
 
     def check(k: int, same: Any) -> None:

@@ -115,8 +115,7 @@ def look_around(
     enough: Callable[[Search], bool],
     progress: Callable[[str], None] | None,
 ) -> tuple[Search | None, Screening]:
-    """The best minimum of searches from many points, None where none is better than the `first`, and what was found;
-    `enough` as of `search_many`."""
+    """The best minimum of searches from many points, None where none is better than the `first`, and what was found."""
     shares = unit_points(starts.count - 1, problem.size, starts.seed)
     points = starting_points(problem, shares, starts)
     size, costs, remark = batch_size(problem, starts.batch, len(points)), np.zeros(len(points)), ""
@@ -234,8 +233,7 @@ def unit_points(count: int, size: int, seed: int) -> Float[np.ndarray, "k n"]:
 
 
 def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], starts: Starts) -> Float[np.ndarray, "l n"]:
-    """Coordinates of the first guess, of the points of `starts`, and of points of the unit cube, its sides as its
-    `ranges` say, of a positive parameter in its logarithm."""
+    """Coordinates of the first guess, of the points of `starts`, and of points of the unit cube within its `ranges`."""
     ranges, points = starts.ranges or {}, {f"Start {k}": point for k, point in enumerate(starts.points)}
     for what, values in {"ranges": ranges, **points}.items():
         unknown = sorted(set(values) - set(problem.names))

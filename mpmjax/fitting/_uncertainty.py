@@ -169,8 +169,7 @@ def _mean_square(robust: float | None) -> float:
 
 
 def seen_together(labels: tuple[str, ...], errors: Uncertainty, logarithmic: tuple[bool, ...]) -> list[str]:
-    """Directions in which the coordinates, logarithmic ones of their values, may change and the data do not, or hardly,
-    in words."""
+    """Directions in which coordinates, or logarithms, may change and the data do not, or hardly, in words."""
     length, correlation, texts = np.where(np.isinf(errors.alone), 1, 1 / errors.alone), errors.correlation, []
     for columns, weak in ((errors.unseen, False), (errors.weak, True)):
         effects = columns * length[:, None]  # on the data
@@ -226,8 +225,8 @@ class Prediction(NamedTuple):
 def banded(
     errors: Uncertainty, level: float, value: Any, J: Any, sigma: np.ndarray | None = None, number: int | None = None
 ) -> Prediction:
-    """Values with their bands, by their derivative J, shape (..., n), and the noise of new measurements, if that is
-    known, of an observation of a `number`, if they are of one."""
+    """Values with their bands, by their derivative J, shape (..., n), and by the noise of new measurements, if known,
+    of the observation of a number, if they are of one."""
     mean, gradient = np.asarray(value, float), np.asarray(J, float)
     has_derivative = np.asarray(np.isfinite(gradient).all(axis=-1))
     gradient = np.where(has_derivative[..., None], gradient, 0)
