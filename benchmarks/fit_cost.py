@@ -90,14 +90,13 @@ def measure(
     b: Block, method: str, count: int, repeats: int, simulation: Callable[[], Any], least: float
 ) -> list[dict[str, Any]]:
     """The three derivatives with so many parameters, or measured numbers, beside the simulation and its megabytes."""
-    sigmas = (jnp.asarray(b.spacing, b.dtype),)
     of = problem(b, method, count, 512)
     few = problem(b, method, 1, count)
     z, one = jnp.zeros(count, b.dtype), jnp.zeros(1, b.dtype)
     programs = {
-        "gradient, reverse": compiled(lambda z: of.gradient(z, sigmas), z),
-        "Jacobian, forward": compiled(lambda z: of.jacobian(z, sigmas, "forward"), z),
-        "Jacobian, reverse": compiled(lambda z: few.jacobian(z, sigmas, "reverse"), one),
+        "gradient, reverse": compiled(lambda z: of.gradient(z), z),
+        "Jacobian, forward": compiled(lambda z: of.jacobian(z, "forward"), z),
+        "Jacobian, reverse": compiled(lambda z: few.jacobian(z, "reverse"), one),
     }
     seconds = medians({"simulation": simulation} | {kind: call for kind, (call, _) in programs.items()}, repeats)
     particles = len(b.x) * (2 * 2 + 1 + 1 + 2 * 4) * np.dtype(b.dtype).itemsize / 1e6
@@ -142,8 +141,8 @@ def main() -> None:
     b = block(2, 900, 48, 4, "float32")
     rows = []
     for method in METHODS:
-        of, sigmas = problem(b, method, 1, 512), (jnp.asarray(b.spacing, b.dtype),)
-        alone = compiled(lambda z: of.residuals(z, sigmas, diffrax.ForwardMode())[0], jnp.zeros(1, b.dtype))  # noqa: B023
+        of = problem(b, method, 1, 512)
+        alone = compiled(lambda z: of.residuals(z, diffrax.ForwardMode())[0], jnp.zeros(1, b.dtype))  # noqa: B023
         for count in (2, 8) if options.quick else (2, 8, 32):
             rows += measure(b, method, count, 3 if options.quick else 5, *alone)
             for row in rows[-3:]:

@@ -119,13 +119,12 @@ def one_by_one(pull: mpm.Experiment, points: np.ndarray) -> list[float]:
 def iteration(pull: mpm.Experiment, points: np.ndarray, batch: int) -> Callable[[], Any]:
     """An iteration of so many searches together."""
     problem, optimiser = FitProblem((pull,), PARAMETERS), mpm.fitting.LevenbergMarquardt()
-    common = problem, problem.first_sigmas
-    none = jax.tree.map(lambda _: None, common)
-    states = [optimiser.begin(problem, jnp.asarray(z), problem.first_sigmas) for z in points[:batch]]
+    none = jax.tree.map(lambda _: None, problem)
+    states = [optimiser.begin(problem, jnp.asarray(z)) for z in points[:batch]]
     arrays, rest = zip(*(eqx.partition(s, eqx.is_array) for s in states), strict=True)
     state = eqx.combine(jax.tree.map(lambda *a: np.stack(a), *arrays), rest[0])
     return lambda: eqx.filter(
-        iterate_together(none, common, optimiser, points[:batch], state),
+        iterate_together(none, problem, optimiser, state),
         eqx.is_array,
     )
 

@@ -17,7 +17,7 @@ from test_schema import EXAMPLES
 
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._result import fit_result
+from mpmjax.fitting._result import Minimum, fit_result
 from mpmjax.fitting._search import Search
 
 SCENE, PARTICLES = block(2)
@@ -42,8 +42,8 @@ def found() -> mpm.fitting.FitResult:
     problem = FitProblem((mpm.Experiment(**RUN, observations=SEEN),), {"E": STIFFNESS})
     seen = mpm.fitting.Evaluation(jnp.zeros(()), jnp.zeros(1), jnp.zeros(1), jnp.ones((1, 1)))
     at = Search(jnp.zeros(1), None, seen, (), converged=True)
-    settled = [(jnp.ones(()), 1.0, 1.0)]
-    return fit_result(problem, mpm.fitting.LevenbergMarquardt(), at, settled, {}, 0.95)
+    minimum = Minimum(problem, at, [(jnp.ones(()), 1.0, 1.0)], moves=False)
+    return fit_result(minimum, mpm.fitting.LevenbergMarquardt(), {}, 0.95)
 
 
 FITTED = found()

@@ -77,7 +77,7 @@ def test_summary_says_how_many_steps_were_indefinite(folder):
     start, run = read_simulation(folder / "scene.toml").particles, mpm.load(folder / "run.h5")
     assert "indefinite" not in (folder / "summary").read_text()
     run = eqx.tree_at(lambda r: r.statistics.indefinite, run, run.statistics.indefinite + 5)
-    assert re.search(r"\nindefinite +the system of 5 of 6 steps", _summary(start, run, 6, 1.0))
+    assert dict(_summary(start, run, 6, 1.0))["indefinite"].startswith("the system of 5 of 6 steps")
 
 
 def test_run_writes_the_frames_and_a_summary(folder):

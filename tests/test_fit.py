@@ -13,7 +13,7 @@ import pytest
 import mpmjax as mpm
 from mpmjax.fitting._evaluation import Kept, costs_at, evaluated, parts_kept
 from mpmjax.fitting._observation import between
-from mpmjax.fitting._problem import FitProblem
+from mpmjax.fitting._problem import FitProblem, first_noise
 from mpmjax.fitting._result import Estimate, NoiseEstimate
 from mpmjax.fitting._search import jacobian, search, search_many
 from mpmjax.fitting._sequence import _extrapolate, _missed
@@ -122,14 +122,13 @@ def test_the_jacobian_is_that_of_differences():
     ]
     speed = mpm.Unbounded(update=lambda e, s: eqx.tree_at(lambda e: e.particles.v, e, s * e.particles.v), start=1.0)
     problem = FitProblem((experiment(seen),), {"E": STIFFNESS, "speed": speed})
-    sigmas = tuple(jnp.asarray(o.sigma) for o in seen)
     z = jnp.asarray([0.1, -0.05])
-    r, J = eqx.filter_jit(problem.jacobian)(z, sigmas)
+    r, J = eqx.filter_jit(problem.jacobian)(z)
     assert r.shape == (x.size + len(times[::2]),)
     h = 1e-5
     for k in range(2):
         step = h * jnp.eye(2)[k]
-        ends = [eqx.filter_jit(problem.jacobian)(z + s * step, sigmas)[0] for s in (1, -1)]
+        ends = [eqx.filter_jit(problem.jacobian)(z + s * step)[0] for s in (1, -1)]
         difference = (ends[0] - ends[1]) / (2 * h)
         assert np.abs(J[:, k] - difference).max() < 1e-6 * np.abs(difference).max()
 
@@ -143,10 +142,10 @@ class Line(FitProblem):
         (scene, particles), t1 = bar(), STEPS * DT
         self.experiments = (mpm.Experiment(scene, particles, t1=t1, dt=DT, observations=observations),)
         self.names, self.parameters = ("a",), (mpm.Unbounded(lambda e: e.scene.gravity[0], start=1.0, prior=prior),)
-        self.starts, self.x = (jnp.asarray(1.0),), x
+        self.starts, self.x, self.sigmas = (jnp.asarray(1.0),), x, first_noise(self.experiments)
 
-    def residuals(self, z, sigmas, adjoint):
-        parts = [o.residuals((1 + z[0]) * self.x, s) for o, s in zip(self.observations, sigmas, strict=True)]
+    def residuals(self, z, adjoint):
+        parts = [o.residuals((1 + z[0]) * self.x, s) for o, s in zip(self.observations, self.sigmas, strict=True)]
         prior = self.parameters[0].prior
         return jnp.concatenate(parts + ([] if prior is None else [prior.residuals(1 + z, 1 + z)])), jnp.zeros(1)
 
@@ -398,14 +397,14 @@ class Failing(FitProblem):
     def dtype(self):
         return jnp.float64
 
-    def jacobian(self, z, sigmas, mode=None):
+    def jacobian(self, z, mode=None):
         far = jnp.where(z < self.end, z, jnp.nan)
         return 100 * ((0.3 + far) ** 3 - 0.5), 100 * (3 * (0.3 + far) ** 2)[:, None]
 
 
 def test_a_step_at_which_the_simulation_fails_is_not_taken():
     """The first Gauss-Newton step goes beyond z = 1."""
-    found = search(Failing(1.0), mpm.fitting.LevenbergMarquardt(), jnp.zeros(1), ())
+    found = search(Failing(1.0), mpm.fitting.LevenbergMarquardt(), jnp.zeros(1))
     assert found.converged
     assert not all(iteration.accepted for iteration in found.history)
     assert float(found.z[0]) == pytest.approx(0.5 ** (1 / 3) - 0.3, rel=1e-5)
@@ -414,11 +413,11 @@ def test_a_step_at_which_the_simulation_fails_is_not_taken():
 def test_a_search_that_ends_where_simulations_begin_to_fail_has_not_converged():
     """The minimum, z = 0.494, lies beyond z = 0.4, where they fail; among others it ends as alone."""
     lm = mpm.fitting.LevenbergMarquardt(max_steps=200)
-    alone = search(Failing(0.4), lm, jnp.zeros(1), ())
+    alone = search(Failing(0.4), lm, jnp.zeros(1))
     assert not alone.converged
     assert len(alone.history) < 200
     assert float(alone.z[0]) == pytest.approx(0.4, abs=1e-2)
-    among = search_many([(Failing(0.4), ())], lm, dict.fromkeys(range(2), np.zeros(1)), batch=2)[1]
+    among = search_many([Failing(0.4)], lm, dict.fromkeys(range(2), np.zeros(1)), batch=2)[1]
     assert (among.converged, len(among.history)) == (False, len(alone.history))
 
 
@@ -429,14 +428,14 @@ class Saturated(Failing):
         super().__init__(jnp.inf)
         self.names, self.parameters, self.starts = ("a", "b"), (STIFFNESS,) * 2, (jnp.ones(()),) * 2
 
-    def jacobian(self, z, sigmas, mode=None):
+    def jacobian(self, z, mode=None):
         residuals = lambda z: 100 * jnp.stack([z[0] + 1, jax.nn.sigmoid(3 * (z[1] + 2.5)) - 0.5])  # noqa: E731
         return residuals(z), jax.jacfwd(residuals)(z)
 
 
 def test_no_step_goes_where_a_straight_line_cannot_know():
     """The first Gauss-Newton step, to z = −300, would lower Σ r² by the other number, where this one is not seen."""
-    found = search(Saturated(), mpm.fitting.LevenbergMarquardt(), jnp.zeros(2), ())
+    found = search(Saturated(), mpm.fitting.LevenbergMarquardt(), jnp.zeros(2))
     assert found.converged
     assert np.allclose(found.z, [-1, -2.5], atol=1e-5)
     assert len(found.history) < 15
@@ -449,7 +448,7 @@ class Rounded(Failing):
     def dtype(self):
         return jnp.float32
 
-    def jacobian(self, z, sigmas, mode=None):
+    def jacobian(self, z, mode=None):
         x, z = jnp.linspace(-1.0, 1.0, 400), z.astype("f4").astype(float)
         rounding = 5e-4 * jnp.cos(1e7 * z * x)
         return (100 + x * (z - 1) + z**2 / 1000 + rounding).astype("f4"), (x + z / 500)[:, None].astype("f4")
@@ -458,7 +457,7 @@ class Rounded(Failing):
 def test_a_search_ends_where_no_step_can_lower_the_sum_of_squares_by_more_than_its_rounding():
     """The misfit is large, as that of a law which does not explain the data, and so is its rounding. The standard error
     of z is 8.7."""
-    found = search(Rounded(jnp.inf), mpm.fitting.LevenbergMarquardt(), jnp.zeros(1), ())
+    found = search(Rounded(jnp.inf), mpm.fitting.LevenbergMarquardt(), jnp.zeros(1))
     z, squares = np.linspace(0.0, 1.0, 100_001), (np.linspace(-1.0, 1.0, 400) ** 2).sum()
     least = z[np.argmin(400 * (100 + z**2 / 1000) ** 2 + squares * (z - 1) ** 2)]
     assert found.converged
@@ -691,8 +690,8 @@ def test_numbers_of_observations_have_derivatives_in_a_program_of_their_own():
     seen = mpm.Series(times, x[:, 0], Scaled(jnp.asarray(1.1)), sigma=NOISE)
     of = {"E": STIFFNESS, "unit": mpm.Positive(lambda e: e.observations[0].of.unit)}
     whole = [FitProblem(experiment(seen), of, memory) for memory in (2**28, 1)]
-    z, sigmas = jnp.array([0.05, -0.1]), (jnp.asarray(NOISE),)
-    (r, J), (expected, by_each) = (jacobian(problem, z, sigmas) for problem in whole)
+    z = jnp.array([0.05, -0.1])
+    (r, J), (expected, by_each) = (jacobian(problem, z) for problem in whole)
     assert [parts_kept(problem, 3) is None for problem in whole] == [False, True]
     np.testing.assert_allclose(r, expected, rtol=1e-9)
     np.testing.assert_allclose(J, by_each, rtol=1e-9, atol=1e-9 * np.abs(by_each).max())
@@ -712,26 +711,25 @@ def test_a_new_observation_leaves_the_program_of_the_run_as_it_is(caplog):
     def first(scene, particles):
         return particles.x[0]
 
-    z, sigmas, points = jnp.zeros(1), (jnp.asarray(NOISE),), np.linspace(-0.1, 0.1, 3)[:, None]
-    kept = parts_kept(problem(first), 2)
-    assert kept == (Kept((True, False, False, False)),)  # of x, v, C and F
+    z, points = jnp.zeros(1), np.linspace(-0.1, 0.1, 3)[:, None]
+    assert parts_kept(problem(first), 2) == (Kept((True, False, False, False)),)  # of x, v, C and F
     with jax.log_compiles():
-        at, squares = evaluated(problem(first), z, sigmas, kept), costs_at(problem(first), points, sigmas, 3)
+        at, squares = evaluated(problem(first), z), costs_at(problem(first), points, 3)
     names = [record.getMessage() for record in caplog.records]
     assert sum("compilation of jit(_run)" in name for name in names) == 2
     scarce = problem(first, 1)
-    r, J = jacobian(scarce, z, sigmas)
+    r, J = jacobian(scarce, z)
     assert parts_kept(scarce, 1) is None
     np.testing.assert_allclose(at.residuals, r, rtol=1e-9, atol=1e-9 * np.abs(r).max())
     np.testing.assert_allclose(at.jacobian, J, rtol=1e-9, atol=1e-9 * np.abs(J).max())
-    np.testing.assert_allclose(squares, costs_at(scarce, points, sigmas, 3), rtol=1e-9)
+    np.testing.assert_allclose(squares, costs_at(scarce, points, 3), rtol=1e-9)
     assert squares[1] == pytest.approx((r**2).sum() / 2)
     of["E"] = eqx.tree_at(lambda p: p.where, STIFFNESS, lambda e: e.scene.material.youngs_modulus)
     third = problem(lambda scene, particles: particles.x[3] - particles.x[0])
     caplog.clear()
     with jax.log_compiles():
-        assert np.abs(evaluated(third, z, sigmas, kept).residuals - at.residuals).max() > 1
-        costs_at(third, points, sigmas, 3)
+        assert np.abs(evaluated(third, z).residuals - at.residuals).max() > 1
+        costs_at(third, points, 3)
     names = [record.getMessage() for record in caplog.records]
     assert sum("compilation of jit(_compared)" in name for name in names) == 2
     assert not any("compilation of jit(_run)" in name for name in names)

@@ -18,7 +18,7 @@ from scipy.stats import norm, t
 
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._result import fit_result
+from mpmjax.fitting._result import Minimum, fit_result
 from mpmjax.fitting._search import Search, search, search_many
 from mpmjax.fitting._uncertainty import _mean_square, noise, seen_together, uncertainty
 from mpmjax.viz import write_fit
@@ -148,7 +148,7 @@ def test_what_a_fit_says_follows_from_its_residuals(fall):
     drawn = eqx.tree_at(lambda o: (o.weight, o.robust), o, (0.5, 0.7), is_leaf=lambda a: a is None)
     (value,), (J,) = result.fitted
     r, column = jax.jvp(
-        lambda p: drawn.residuals(p, result.sigmas[0]), (jnp.asarray(value),), (jnp.asarray(J[..., 0]),)
+        lambda p: drawn.residuals(p, result.problem.sigmas[0]), (jnp.asarray(value),), (jnp.asarray(J[..., 0]),)
     )
     parts = {"residuals": np.asarray(r), "jacobian": np.asarray(column)[:, None]}
     moved = replace(result, experiments=(replace(e, observations=(drawn,)),), **parts)
@@ -224,10 +224,10 @@ class Abrupt(FitProblem):
     def __init__(self, beyond, slope=0.5):
         whole = FitProblem((thrown(measured(sigma=1.0)),), {"v": SPEED})
         self.experiments, self.names = whole.experiments, whole.names
-        self.parameters, self.starts = whole.parameters, whole.starts
+        self.parameters, self.starts, self.sigmas = whole.parameters, whole.starts, whole.sigmas
         self.beyond, self.slope = jnp.asarray(beyond), slope
 
-    def residuals(self, z, sigmas, adjoint):
+    def residuals(self, z, adjoint):
         return jnp.where(z < 1, z, self.beyond) * jnp.ones(STEPS) * self.slope / np.sqrt(STEPS), jnp.zeros(1)
 
     def result(self):
@@ -235,7 +235,7 @@ class Abrupt(FitProblem):
         column = jnp.full((STEPS, 1), self.slope / np.sqrt(STEPS))
         seen = mpm.fitting.Evaluation(jnp.zeros(()), jnp.zeros(1), jnp.zeros(STEPS), column)
         found = Search(jnp.zeros(1), None, seen, (), converged=True)
-        return fit_result(self, mpm.fitting.LevenbergMarquardt(), found, GIVEN_NOISE, {}, 0.95)
+        return fit_result(Minimum(self, found, GIVEN_NOISE, moves=False), mpm.fitting.LevenbergMarquardt(), {}, 0.95)
 
 
 @pytest.mark.parametrize(
@@ -263,17 +263,17 @@ class Kinked(Abrupt):
     """3 |z − 0.3| + 1 and noise ±1, as where friction begins to stick: a straight line asks for steps across z = 0.3,
     of 1/3, which no step finds."""
 
-    def residuals(self, z, sigmas, adjoint):
+    def residuals(self, z, adjoint):
         return 3 * jnp.abs(z - 0.3) + 1 + jnp.asarray(np.arange(STEPS) % 2 * 2.0 - 1), jnp.zeros(1)
 
 
 def test_a_search_that_meets_a_kink_ends_soon_says_so_and_holds_the_step_left_undone():
     lm, problem = mpm.fitting.LevenbergMarquardt(), Kinked(0.0)
-    found = search_many([(problem, (jnp.ones(()),))], lm, {0: np.zeros(1)})[0]
+    found = search_many([problem], lm, {0: np.zeros(1)})[0]
     assert not found.converged
     assert len(found.history) < 25
     assert float(found.z[0]) == pytest.approx(0.3, abs=1e-2)
-    result = fit_result(problem, lm, found, GIVEN_NOISE, {}, 0.95)
+    result = fit_result(Minimum(problem, found, GIVEN_NOISE, moves=False), lm, {}, 0.95)
     assert any("kink" in text for text in result.warnings)
     (estimate,) = result.estimates
     assert estimate.interval[0] < 1.3 - 0.3 < 1.3 + 0.3 < estimate.interval[1]
@@ -284,13 +284,13 @@ class Bent(Kinked):
     """100 z and 100 + 95 z²/2: Σ r² is 1.95 times as curved as straight lines say, so that each of their steps ends
     nearly as far beyond the minimum as it began before it."""
 
-    def residuals(self, z, sigmas, adjoint):
+    def residuals(self, z, adjoint):
         return 100 * jnp.zeros(STEPS).at[0].set(z[0]).at[1].set(1 + 0.95 * z[0] ** 2 / 2), jnp.zeros(1)
 
 
 def test_a_search_does_not_swing_from_side_to_side_of_a_minimum():
     lm = mpm.fitting.LevenbergMarquardt()
-    found = search_many([(Bent(0.0), (jnp.ones(()),))], lm, {0: np.ones(1)})[0]
+    found = search_many([Bent(0.0)], lm, {0: np.ones(1)})[0]
     assert found.converged
     assert float(found.z[0]) == pytest.approx(0.0, abs=1e-3)
     assert len(found.history) < 15
@@ -306,10 +306,10 @@ class Line(FitProblem):
         seen = measured(sigma=1.0)
         whole = FitProblem((thrown(seen),), {"a": parameter, "b": SPEED})
         self.experiments, self.names = whole.experiments, whole.names
-        self.parameters, self.starts = whole.parameters, whole.starts
+        self.parameters, self.starts, self.sigmas = whole.parameters, whole.starts, whole.sigmas
         self.y, self.A, self.plane = jnp.asarray(y), LINE, None
 
-    def residuals(self, z, sigmas, adjoint):
+    def residuals(self, z, adjoint):
         return jnp.asarray(self.A, z.dtype) @ self.numbers(z) - jnp.asarray(self.y, z.dtype), jnp.zeros(1)
 
 
@@ -332,9 +332,9 @@ def beside_a_bound(name, offset, count):
     one = Line(parameter, y[0])
     problems = [eqx.tree_at(lambda line: line.y, one, jnp.asarray(own)) for own in y]
     lm = mpm.fitting.LevenbergMarquardt()
-    each = [(problem, (jnp.ones(()),)) for problem in problems]
-    ends = search_many(each, lm, dict.fromkeys(range(count), np.zeros(2)), batch=count)
-    results = [fit_result(problem, lm, ends[k], GIVEN_NOISE, {}, 0.95) for k, problem in enumerate(problems)]
+    ends = search_many(problems, lm, dict.fromkeys(range(count), np.zeros(2)), batch=count)
+    minima = (Minimum(problem, ends[k], GIVEN_NOISE, moves=False) for k, problem in enumerate(problems))
+    results = [fit_result(minimum, lm, {}, 0.95) for minimum in minima]
     return truth, y, results
 
 
@@ -347,7 +347,7 @@ def test_a_search_comes_back_from_a_bound_that_hides_the_minimum(name, off):
     truth = np.array([bound + side * 7 * ERROR, 0.3])
     y = LINE @ truth + np.random.default_rng(3).normal(size=STEPS)
     start = np.array([-30.0 * side, off])
-    found = search(Line(parameter, y), mpm.fitting.LevenbergMarquardt(), start, (jnp.ones(()),))
+    found = search(Line(parameter, y), mpm.fitting.LevenbergMarquardt(), start)
     assert found.converged
     values = np.asarray(Line(parameter, y).numbers(found.z))
     assert values == pytest.approx(np.linalg.lstsq(LINE, y)[0], abs=1e-3 * ERROR)
@@ -466,12 +466,12 @@ def test_along_a_profile_the_others_are_at_their_least():
     parameter finds the same misfit. In single precision the interval is the same."""
     result = fit(followed(5e-3, 5e-3), {"E": STIFFNESS, "push": PUSH})
     profile = mpm.fitting.profile(result, "E", points=2)
-    problem, residuals = result.problem, eqx.filter_jit(lambda p, z, s: p.residuals(z, s, None)[0])
+    problem, residuals = result.problem, eqx.filter_jit(lambda p, z: p.residuals(z, None)[0])
 
     def misfit(E):
         def r(z):
             at = jnp.asarray([np.log(E / 1e5), z[0]])
-            return np.asarray(residuals(problem, at, result.sigmas))
+            return np.asarray(residuals(problem, at))
 
         return 2 * least_squares(r, [0.0], method="lm", diff_step=1e-6).cost
 

@@ -19,7 +19,7 @@ import pytest
 
 import mpmjax as mpm
 from mpmjax.fitting import _search
-from mpmjax.fitting._log import _read, described, iterations_left
+from mpmjax.fitting._log import _Log, described, iterations_left
 
 fit = partial(mpm.fit, discretisation=False)  # most of these tests are of the search
 
@@ -217,18 +217,18 @@ def test_a_damaged_log_is_refused(whole, seen, tmp_path):
         def add(_, item):
             if isinstance(item, h5py.Dataset) and item.ndim == 0:
                 flipped.append(item.id.get_offset() + item.dtype.itemsize - 1)
-            elif isinstance(item, h5py.Dataset):
-                item.id.chunk_iter(lambda chunk: zeros.append((chunk.byte_offset, bytes(chunk.size))))
+            elif isinstance(item, h5py.Dataset) and item.size:
+                zeros.append((item.id.get_offset(), bytes(item.id.get_storage_size())))
 
         file.visititems(add)
-    assert len(zeros) > 5 < len(flipped) - 40
+    assert len(zeros) > 5 <= len(flipped) - 40  # five scalars
     for at, damage in [*zeros, *((at, bytes([data[at] ^ 1 << at % 8])) for at in flipped)]:
         path.write_bytes(data[:at] + damage + data[at + len(damage) :])
         with pytest.raises(ValueError, match=rf"^{path} (is damaged|is not the log)"):
-            _read(path, problem, method, described(problem, method))
+            _Log(problem, described(problem, method)).read(path, method)
     with h5py.File(path, "w") as file:
         file.attrs["kind"], file.attrs["format"] = np.bytes_("mpmjax fit log"), 1
-    with pytest.raises(ValueError, match=r"is a log of format 1, this mpmjax reads 3: begin the fit anew"):
+    with pytest.raises(ValueError, match=r"is a log of format 1, this mpmjax reads 4: begin the fit anew"):
         fit(seen, PARAMETERS, log=path, resume=True)
 
 

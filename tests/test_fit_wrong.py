@@ -18,7 +18,7 @@ from mpmjax.fitting._discretisation import CoarseGrid, look_at_coarse_grid, unex
 from mpmjax.fitting._estimate import shape_of, strongest_mode
 from mpmjax.fitting._evaluation import Evaluation
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._result import fit_result
+from mpmjax.fitting._result import Minimum, fit_result
 from mpmjax.fitting._search import Search
 from mpmjax.verification import StandingWave, discretise
 
@@ -152,7 +152,8 @@ def fit_again(found, problem, factor, coarse=None, freedom=None):
     known = Evaluation(0.0, found.z, factor * found.residuals, factor * found.jacobian)
     end = Search(jnp.asarray(found.z), None, known, (), converged=True)
     freedom = float(found.degrees_of_freedom) if freedom is None else freedom
-    return fit_result(problem, found.optimiser, end, [(*found.sigmas, 1.0, freedom)], {}, found.level, coarse)
+    minimum = Minimum(problem, end, [(*found.problem.sigmas, 1.0, freedom)], moves=False)
+    return fit_result(minimum, found.optimiser, {}, found.level, coarse)
 
 
 def test_correlated_numbers_are_worth_what_theory_says():
@@ -244,7 +245,7 @@ class Along(FitProblem):
     def dtype(self):
         return jnp.float64
 
-    def residuals(self, z, sigmas, adjoint):
+    def residuals(self, z, adjoint):
         (e,) = self.experiments
         b = 0.4 * (e.scene.grid.spacing - 1) - 0.3 * (round(e.t1 / e.dt) == 3)
         return jnp.stack([b * self.of(z[0] / b), jnp.ones(())]), jnp.zeros(1)
@@ -262,7 +263,7 @@ class Along(FitProblem):
 )
 def test_the_look_at_twice_the_spacing_takes_three_steps_while_the_misfit_falls(of, by_spacing, by_step):
     """By the Jacobian of the grid itself, 1; the first step stays in any case. The residuals are those of the start."""
-    coarse = look_at_coarse_grid(Along(of), jnp.zeros(1), (), np.array([[1.0], [0.0]]))
+    coarse = look_at_coarse_grid(Along(of), jnp.zeros(1), np.array([[1.0], [0.0]]))
     np.testing.assert_allclose(coarse.moved[:, 0], [by_spacing, by_step], rtol=1e-6)
     np.testing.assert_allclose(coarse.residuals, [-0.4, 1.0])
 

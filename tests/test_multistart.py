@@ -11,7 +11,7 @@ from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
 from mpmjax.fitting._evaluation import costs_at
-from mpmjax.fitting._problem import FitProblem
+from mpmjax.fitting._problem import FitProblem, first_noise
 from mpmjax.fitting._search import search, search_many
 from mpmjax.fitting._starts import critical_distance, linked, starting_points, unit_points
 
@@ -35,13 +35,13 @@ class Oscillation(FitProblem):
         self.experiments = (mpm.Experiment(scene, particles, t1=STEPS * DT, dt=DT, observations=seen),)
         self.names, self.parameters = ("omega",), tuple(parameters.values())
         self.starts = (jnp.asarray(self.parameters[0].start),)
-        self.gap = gap
+        self.gap, self.sigmas = gap, first_noise(self.experiments)
 
-    def residuals(self, z, sigmas, adjoint):
+    def residuals(self, z, adjoint):
         (omega,) = self.values(z)
         predicted = jnp.cos(jnp.where(omega < 2000, omega, jnp.nan) * jnp.asarray(TIMES))
         predicted += jnp.where(abs(omega - self.gap) < 15, jnp.sqrt(0 * omega), 0)  # zero, without a derivative there
-        return self.observations[0].residuals(predicted, sigmas[0]), jnp.zeros(1)
+        return self.observations[0].residuals(predicted, self.sigmas[0]), jnp.zeros(1)
 
 
 OMEGA = mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=500.0)
@@ -105,13 +105,13 @@ def test_points_are_linked_anew_where_a_search_fails(oscillation):
 def test_searches_from_few_points_find_what_searches_from_all_find():
     """The least minimum of the oscillation, for each of ten scramblings of 63 points, by half of the searches."""
     problem = Oscillation([], {"omega": OMEGA})
-    sigmas, found = problem.first_sigmas, []
+    found = []
     for seed in range(10):
         shares = unit_points(63, 1, seed)
         points = starting_points(problem, shares, Starts(ranges={"omega": (100.0, 750.0)}))[1:]
-        members = search_many([(problem, sigmas)], LM, dict(enumerate(points)), batch=63)
+        members = search_many([problem], LM, dict(enumerate(points)), batch=63)
         least = np.array([m.cost for m in members.values()])
-        stands = linked(shares, costs_at(problem, points, sigmas, 63), fraction=0.375)
+        stands = linked(shares, costs_at(problem, points, 63), fraction=0.375)
         assert least[np.unique(stands)].min() == pytest.approx(least.min(), rel=1e-3)
         found.append((len(np.unique(stands)), np.median(least) / least.min()))
     searches, worse = np.array(found).T
@@ -153,10 +153,9 @@ def test_a_search_among_many_goes_where_it_goes_alone():
     """Iteration by iteration, whoever its neighbours are and wherever its place is."""
     problem = Oscillation([], {"omega": OMEGA})
     starts = np.linspace(-1.0, 0.3, 7)[:, None]
-    sigmas = problem.first_sigmas
-    members = search_many([(problem, sigmas)], LM, dict(enumerate(starts)), batch=3)
+    members = search_many([problem], LM, dict(enumerate(starts)), batch=3)
     for start, member in zip(starts, members.values(), strict=True):
-        alone = search(problem, LM, jnp.asarray(start), sigmas)
+        alone = search(problem, LM, jnp.asarray(start))
         assert member.converged == alone.converged
         assert [i.cost for i in member.history] == pytest.approx([i.cost for i in alone.history], rel=1e-6)
         assert np.allclose(member.z, alone.z, atol=1e-9)

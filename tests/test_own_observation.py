@@ -13,9 +13,6 @@ class LargestExtension(mpm.fitting.AbstractObservation):
     """The largest distance between the outermost particles during the run [m], one number."""
 
     data: np.ndarray
-    sigma: np.ndarray | None = None
-    weight: float = 1.0
-    robust: float | None = None
     name: str = "largest extension [m]"
 
     def observe(self, scene, particles):
@@ -41,6 +38,6 @@ def test_a_stiffness_is_fitted_to_an_observation_of_ones_own():
     measured = np.asarray((x.max(axis=1) - x.min(axis=1)).max())[None]
     assert measured[0] > 1.01 * float(jnp.ptp(x[0]))
     scene, particles = bar(8.4e4)
-    pull = mpm.Experiment(scene, particles, t1=T1, dt=DT, observations=LargestExtension(measured, np.array([1e-4])))
+    pull = mpm.Experiment(scene, particles, t1=T1, dt=DT, observations=LargestExtension(measured, sigma=1e-4))
     result = mpm.fit(pull, {"E": mpm.Positive(lambda e: e.scene.material.youngs_modulus, unit="Pa")})
     np.testing.assert_allclose(result.values["E"], 7e4, rtol=1e-4)

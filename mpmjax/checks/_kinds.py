@@ -44,9 +44,8 @@ _WORDS: dict[Any, str] = {
 
 
 def checked(function: Function) -> Function:
-    """Decorate a public function to check that its arguments are of the kinds that their annotations name and have the
-    values that marks ask for (see `require_fields`; else a ValueError), and to allow broadcasting of different ranks
-    within it, whatever `jax_numpy_rank_promotion` says outside."""
+    """Decorate a public function to check the kinds and marks of its arguments (see `require_fields`; else a
+    ValueError), and to allow broadcasting of different ranks, whatever `jax_numpy_rank_promotion` says outside."""
     signature = inspect.signature(function)
     hints = {p.name: p.annotation for p in signature.parameters.values() if p.annotation is not p.empty}
     owner = function.__qualname__.removesuffix(".__init__")
@@ -188,8 +187,8 @@ def _axes(hint: type[AbstractArray]) -> tuple[int, bool]:
 
 
 def choices(hint: Any) -> dict[str, Any]:
-    """The public classes of objects that an annotation takes, and the members of its enumerations, by their names: of a
-    base class, those below it in alphabetical order, a user's own among them."""
+    """The public classes of objects that an annotation takes, of a base class those below it in alphabetical order, a
+    user's own among them, and the members of its enumerations, by their names."""
 
     def below(kind: type) -> dict[str, Any]:
         if is_abstract(kind):

@@ -38,8 +38,8 @@ class Requirement(NamedTuple):
     met: Callable[[], Any]  # computes bools that are all true if it is met
 
 
+# The list in which `requirements` collects; None outside of it, where checks of unknown values are skipped.
 _put_off: ContextVar[list[Requirement] | None] = ContextVar("_put_off", default=None)
-"""The list in which `requirements` collects; None outside of it, where checks of unknown values are skipped."""
 
 
 def requirements(tree: Any) -> list[Requirement]:

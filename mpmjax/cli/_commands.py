@@ -59,23 +59,24 @@ def run_scene(
     taken, seconds = int(run.statistics.steps) - done, time.perf_counter() - begun
     compiling, frames = min(compiled[0], seconds), standing_in(output)[0]
     with reporting(lambda: f"{output} is complete."):
-        print(_summary(simulation.particles, run, taken, seconds))
+        for line in _summary(simulation.particles, run, taken, seconds):
+            print(_line(*line))
         bound = float(stable_dt(run.scene, run.final, method=run.method)) if taken else np.inf
         if np.isfinite(bound):
-            print(f"{'dt':<18} {float(run.dt) / bound:.3g} of the longest that is stable as particles are at the end")
+            print(_line("dt", f"{float(run.dt) / bound:.3g} of the longest that is stable as particles are at the end"))
         stages = f"{begun - started:.3g} s set-up, {compiling:.3g} s compiling, {seconds - compiling:.3g} s steps"
-        print(f"{'stages':<18} {stages}")
-        print(f"{'end':<18} t = {float(run.final_step * run.dt):.6g} s, {frames} frames")
-    reached = f"complete already: it reaches t = {float(run.final_step * run.dt):.6g} s" if resume and not taken else ""
-    print(f"written            {output} ({_bytes(output.stat().st_size)}) {reached}".rstrip())
+        print(_line("stages", stages))
+        end = f"t = {float(run.final_step * run.dt):.6g} s"
+        print(_line("end", f"{end}, {frames} frames"))
+    reached = f" complete already: it reaches {end}" if resume and not taken else ""
+    print(_line("written", f"{output} ({_bytes(output.stat().st_size)}){reached}"))
 
 
 def study_scene(
     path: Path, output: Path, changes: Sequence[str], members: Sequence[Sequence[str]], *, quiet: bool = False
 ) -> None:
-    """Simulate a scene file once for each of some sets of further changes to it, and write a CSV file with a row for
-    each: what changes, the numbers of its last frame (see `table`), and what a run that failed says. All runs are one
-    compiled program."""
+    """Simulate a scene file once for each of some sets of further changes, by one compiled program, and write a CSV
+    file with a row each: what changes, the numbers of the last frame (see `table`), and what a run that failed says."""
 
     def simulation(member: Sequence[str]) -> Simulation:
         return read_simulation(path, [*changes, *member])
@@ -132,10 +133,10 @@ def _compilation() -> Iterator[list[float]]:
 
 def _chosen(scene: Path, most_seconds: float | None, changes: Sequence[str] = (), *, quiet: bool = False) -> Simulation:
     """The simulation of a scene file; pilot runs are reported on standard error, their choice on standard output."""
-    told = {} if quiet else {"progress": lambda trial: _print_error(_line(trial)), "say": _print_error}
+    told = {} if quiet else {"progress": lambda trial: _print_error(_row(trial)), "say": _print_error}
     simulation = read_simulation(scene, changes, most_seconds=most_seconds, **told)
     if simulation.choice is not None:
-        print(f"{'chosen':<18} {simulation.choice}")
+        print(_line("chosen", simulation.choice))
     return simulation
 
 
@@ -143,59 +144,51 @@ def _print_error(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
+def _line(name: str, text: str) -> str:
+    return f"{name:<18} {text}"
+
+
 def _bytes(size: int | float) -> str:
     k, unit = next((k, unit) for k, unit in ((1e9, "GB"), (1e6, "MB"), (0, "kB")) if size >= k)
     return f"{size / (k or 1e3):.3g} {unit}"
 
 
-def _summary(start: Particles, run: Run, taken: int = 0, seconds: float = 0.0) -> str:
+def _summary(start: Particles, run: Run, taken: int = 0, seconds: float = 0.0) -> Iterator[tuple[str, str]]:
     """The cost of `taken` steps of a run in these seconds, if any, and how well it kept mass and energy."""
     s, p, steps = run.statistics, run.final.count, max(int(run.statistics.steps), 1)
     before, after = energy(run.scene, start), energy(run.scene, run.final)
     whole, parts = pieces(run.scene, start), pieces(run.scene, run.final)
     mass, linearisation = float(run.final.mass.sum()), float(s.linearisation_error)
-    lost = (float(grid_mass(run.scene, run.final)) - mass) / mass
-    lines = [
-        (True, "particles", f"{p}"),
-        (True, "steps", f"{int(s.steps)} of {float(run.dt):.4g} s with {type(run.method).__name__}"),
-        (
-            taken > 0,
-            "wall time",
-            f"{seconds:.3g} s, {taken * p / (seconds or 1):.3g} particle-steps per second, both with compilation",
-        ),
-        (taken > 0, "sums", f"{backend()}"),
-        (
-            int(s.iterations) > 0,
-            "solver",
-            f"{int(s.iterations) / steps:.3g} iterations a step, at most {int(s.most_iterations)}, worst relative "
-            f"residual {float(s.worst_residual):.2g}",
-        ),
-        (linearisation > 0, "linearisation", f"error of at most {linearisation:.2g} of the elastic force in a step"),
-        (int(s.newton) > 0, "Newton", f"{int(s.newton) / steps:.3g} a step, {int(s.line_search)} halvings"),
-        (
-            int(s.indefinite) > 0,
-            "indefinite",
-            f"the system of {int(s.indefinite)} of {steps} steps: compressed material; if the motion looks wrong, "
-            'reduce dt or take hessian = { kind = "AnalyticHessian", projected = true }',
-        ),
-        (int(s.violations) > 0, "contact", f"{int(s.violations)} conditions left violated"),
-        (
-            parts > whole,
-            "pieces",
-            f"{whole} at the start, {parts} at the end; if nothing was to part, this is numerical fracture: more "
-            "particles a cell, or TotalLagrangian",
-        ),
-    ]
+    yield "particles", f"{p}"
+    yield "steps", f"{int(s.steps)} of {float(run.dt):.4g} s with {type(run.method).__name__}"
+    if taken:
+        rate = f"{taken * p / (seconds or 1):.3g} particle-steps per second"
+        yield "wall time", f"{seconds:.3g} s, {rate}, both with compilation"
+        yield "sums", f"{backend()}"
+    if int(s.iterations):
+        iterations = f"{int(s.iterations) / steps:.3g} iterations a step, at most {int(s.most_iterations)}"
+        yield "solver", f"{iterations}, worst relative residual {float(s.worst_residual):.2g}"
+    if linearisation > 0:
+        yield "linearisation", f"error of at most {linearisation:.2g} of the elastic force in a step"
+    if int(s.newton):
+        yield "Newton", f"{int(s.newton) / steps:.3g} a step, {int(s.line_search)} halvings"
+    if int(s.indefinite):
+        advice = 'if the motion looks wrong, reduce dt or take hessian = { kind = "AnalyticHessian", projected = true }'
+        yield "indefinite", f"the system of {int(s.indefinite)} of {steps} steps: compressed material; {advice}"
+    if int(s.violations):
+        yield "contact", f"{int(s.violations)} conditions left violated"
+    if parts > whole:
+        advice = "this is numerical fracture: more particles a cell, or TotalLagrangian"
+        yield "pieces", f"{whole} at the start, {parts} at the end; if nothing was to part, {advice}"
     end = float(run.final_step * run.dt)
     for what, received in (("collider", run.final_collider_impulse), ("boundary", run.final_boundary_impulse)):
-        for k, impulse in enumerate(() if received is None else np.asarray(received.impulse)):
-            force = ", ".join(f"{a:.6g}" for a in impulse / end) if end > 0 else ""
-            lines.append((end > 0, f"on {what} {k}", f"a mean force of {force} N"))
+        for k, impulse in enumerate(() if received is None or not end > 0 else np.asarray(received.impulse)):
+            yield f"on {what} {k}", f"a mean force of {', '.join(f'{a:.6g}' for a in impulse / end)} N"
     for name in ("kinetic", "elastic", "potential", "total"):
         a, b = float(getattr(before, name)), float(getattr(after, name))
-        lines.append((True, f"{name} energy", f"{a + 0.0:.6g} J to {b + 0.0:.6g} J, change {b - a:+.3g} J"))
-    lines.append((True, "mass", f"{mass:.6g} kg; relative error of the grid's mass {lost:+.1e}"))
-    return "\n".join(f"{name:<18} {text}" for shown, name, text in lines if shown)
+        yield f"{name} energy", f"{a + 0.0:.6g} J to {b + 0.0:.6g} J, change {b - a:+.3g} J"
+    lost = (float(grid_mass(run.scene, run.final)) - mass) / mass
+    yield "mass", f"{mass:.6g} kg; relative error of the grid's mass {lost:+.1e}"
 
 
 def fit_scene(
@@ -291,14 +284,14 @@ def chart_scene(scene: Path, output: Path, changes: Sequence[str], *, error: flo
         error=error,
         also=extra,
         most_seconds=file.run.most_seconds if most_seconds is None else most_seconds,
-        progress=lambda trial: print(_line(trial), flush=True),
+        progress=lambda trial: print(_row(trial), flush=True),
         say=_print_error,
     )
     print(comparison.verdict())
     print(f"written {draw_chart(comparison, output)} and {write_trials(comparison, output.with_suffix('.csv'))}")
 
 
-def _line(trial: Trial) -> str:
+def _row(trial: Trial) -> str:
     outcome = "failed" if np.isinf(trial.error) else "foreseen" if np.isnan(trial.error) else f"{trial.error:.2e}"
     linearisation = f"{trial.linearisation_error:.1e}" if trial.linearisation_error > 0 else ""
     return (
@@ -314,7 +307,7 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
     x, dx = np.asarray(particles.x), float(scene.grid.spacing)
 
     def say(name: str, text: str) -> None:
-        print(f"{name:<18} {text}", flush=True)
+        print(_line(name, text), flush=True)
 
     say("materials", ", ".join(scene.titles))
     each = float(scene.grid.section(x, particles.volume).mean()) / dx**particles.dim
@@ -361,19 +354,19 @@ def check_scene(path: Path, changes: Sequence[str], plot: Path | None) -> None:
 def describe_run(path: Path, table_path: Path | None = None) -> str:
     """A run's file in words; its table as CSV, if a place for that is given."""
     run = load(path)
-    lines = {
-        "file": f"{path}, {_bytes(path.stat().st_size)}, {run.final.x.dtype}",
-        "frames": f"{len(run)}, from t = {float(run.times[0]):.6g} s to {float(run.times[-1]):.6g} s",
-        "materials": ", ".join(run.scene.titles),
-    }
-    described = [*(f"{name:<18} {text}" for name, text in lines.items()), _summary(run.frame(0), run)]
+    described = [
+        ("file", f"{path}, {_bytes(path.stat().st_size)}, {run.final.x.dtype}"),
+        ("frames", f"{len(run)}, from t = {float(run.times[0]):.6g} s to {float(run.times[-1]):.6g} s"),
+        ("materials", ", ".join(run.scene.titles)),
+        *_summary(run.frame(0), run),
+    ]
     if table_path is not None:
         columns = table(path)
         with replacing(table_path) as aside:
             head = ",".join(columns)
             np.savetxt(aside, np.stack(list(columns.values()), axis=1), "%.17g", ",", header=head, comments="")
-        described.append(f"{'written':<18} {table_path}")
-    return "\n".join(described)
+        described.append(("written", str(table_path)))
+    return "\n".join(_line(*line) for line in described)
 
 
 def installation() -> str:

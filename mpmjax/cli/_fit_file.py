@@ -39,18 +39,13 @@ class FitFile(NamedTuple):
     horizons: tuple[float, ...] | bool  # until which times it is fitted first [s]; true to choose them, false for none
     refine: tuple[int, ...]  # on how many times as many cells a direction it is fitted besides; empty for none
     discretisation: bool  # whether a single grid's fit looks at twice the spacing
-    whole: tuple[Experiment, ...]
-    """The experiments over the whole of their runs, with all that was measured: also what is not fitted."""
+    whole: tuple[Experiment, ...]  # the experiments until the ends of their runs, with all that was measured
     refined: Callable[[int], tuple[tuple[Experiment, ...], tuple[Experiment, ...]]]
     """The experiments and the whole ones on n times as many cells a direction, with steps n times shorter, from n."""
 
 
 def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -> FitFile:
-    """Read a scene file with its `[fit]` table, and the scene files of other experiments that it names.
-
-    Args:
-        path: the file.
-        read: reads each scene file.
+    """Read a scene file with its `[fit]` table, and the scene files of other experiments that it names, each by `read`.
 
     Raises:
         ValueError: as `read_simulation`; no `[fit]` table, or one that does not fit: one line that names the place.
@@ -224,8 +219,7 @@ _OF_THE_BODY = ("Velocity", "Spin")  # parameters of the initial motion of all p
 
 
 def _of_the_body(kind: str, where: str, experiment: Experiment, common: dict[str, Any]) -> Unbounded:
-    """The velocity of the centre of mass at the start [m/s], d numbers; or the rate at which the body turns about it
-    besides what the file says [rad/s], one number in two dimensions and three in three."""
+    """The velocity of the centre of mass at the start [m/s], or a rate of turning about it besides [rad/s]."""
     particles = experiment.particles
     d = particles.dim
     if kind == "Velocity":

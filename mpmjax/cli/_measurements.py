@@ -47,8 +47,7 @@ class Measurement:
     folder: Path  # where the scene file lies
     data: str
     unit: Annotated[Scalar, _POSITIVE] = 1.0
-    scale: Annotated[Scalar, finite, _NOT_ZERO] = 1.0
-    """Factor beside the unit: -1 turns a direction, 2 makes a whole of what half a model feels."""
+    scale: Annotated[Scalar, finite, _NOT_ZERO] = 1.0  # beside the unit: -1 turns a direction, 2 is of half a model
     time: str
     time_unit: Annotated[Scalar, positive] = 1.0
     length_unit: Annotated[Scalar, positive] = 1.0
@@ -73,8 +72,17 @@ class Measurement:
         return Columns(self.folder / self.data, *names)
 
     def times(self, columns: Columns, *, grow: bool = True) -> np.ndarray:
-        """The times of the rows [s]."""
-        return columns.times(self.time, float(self.time_unit), self.simulation.t1, grow=grow)
+        """The times of the rows [s], which must lie in the run and, with `grow`, grow from row to row."""
+        name, unit, t1 = self.time, float(self.time_unit), self.simulation.t1
+        times = columns.scaled(name, unit, "time_unit")
+        read, advice = (f", with time_unit = {unit:g},", "") if unit != 1 else ("", ", or give time_unit")
+        columns.require(times >= 0, f"{name} {{{name}}} lies before the run, which begins at 0: leave the row out.")
+        beyond = f"after the end of the run, t1 = {t1:g} s: raise [run] t1, leave the row out{advice}."
+        columns.require(~after(times, t1), f"{name} {{{name}}}{read} lies {beyond}")
+        if grow:
+            late = f"{name} {{{name}}} must be later than in the row before: sort the rows by time."
+            columns.require(np.diff(times, prepend=-np.inf) > 0, late)
+        return times
 
     def scaled(self, columns: Columns, name: str) -> np.ndarray:
         """A column in SI units, by its factor."""
@@ -115,8 +123,7 @@ class Measurement:
             )
 
 
-KINDS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {}
-"""Functions of a measurement and keys of their own that make the observations of a kind, and shared keys not taken."""
+KINDS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {}  # what makes a kind, and shared keys it is without
 _HEADER = "[[fit.observation]]"
 
 
@@ -152,8 +159,7 @@ def keys_of(kind: str) -> tuple[Callable[..., None], list[str]]:
     return keys, [p.name for p in shared]
 
 
-_SI = {"place": "m", "force": "N", "torque": "N m", "nominal_stress": "Pa"}
-"""Units of the columns that keys name, where they are always the same."""
+_SI = {"place": "m", "force": "N", "torque": "N m", "nominal_stress": "Pa"}  # of columns that keys name
 
 
 def _shown(made: Any, m: Measurement, keys: dict[str, Any]) -> Any:
@@ -253,15 +259,14 @@ def _tracks(m: Measurement, *, marker: str, place: tuple[str, ...]) -> Tracks:
 
 @_kind("Force")
 def _force(m: Measurement, *, force: tuple[str, ...], collider: int = 0, boundary: int | None = None) -> Force:
-    t, values = m.components(force, m.dim)
-    return Force(t, values, collider=collider, boundary=boundary, **m.named("force [N]"))
+    return Force(*m.components(force, m.dim), collider=collider, boundary=boundary, **m.named("force [N]"))
 
 
 @_kind("Torque")
 def _torque(m: Measurement, *, torque: tuple[str, ...], collider: int = 0, boundary: int | None = None) -> Torque:
     require(m.dim > 1, f"{_HEADER} Torque needs two or three dimensions.")
-    t, values = m.components(torque, m.dim * (m.dim - 1) // 2)
-    return Torque(t, values, collider=collider, boundary=boundary, **m.named("torque [N m]"))
+    series = m.components(torque, m.dim * (m.dim - 1) // 2)
+    return Torque(*series, collider=collider, boundary=boundary, **m.named("torque [N m]"))
 
 
 @_kind("ForceDisplacement", without=("time", "time_unit"))

@@ -157,8 +157,8 @@ def read_simulation(
     progress: Callable[[Trial], None] = lambda trial: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Simulation:
-    """Read a scene file (see `read_scene_file`), and resolve its "stable" step or what it leaves to pilot runs by
-    "auto", within `most_seconds` or what the file says. `progress` and `say` are those of `work_precision`."""
+    """Read a scene file (see `read_scene_file`), its "stable" step and what "auto" leaves to pilot runs, within
+    `most_seconds` or what the file says. `progress` and `say` are those of `work_precision`."""
     file = read_scene_file(path, changes)
     run, choice = file.run, None
     t1, dt, method, save_every = run.t1, step_of(path, file), run.method, run.save_every
@@ -242,8 +242,7 @@ def _lists(material: Any) -> list[str]:
 
 
 def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> tuple[Particles, bool]:
-    """The particles of all tables, those of each material together, in the materials' order, and whether tables
-    overlap, with a warning."""
+    """The particles of all tables, in the materials' order, and whether tables overlap, with a warning."""
     filled: list[list[Particles]] = [[] for _ in scene.laws]
     placed: list[tuple[int, AbstractRegion, np.ndarray]] = []
     grid, dx = scene.grid, float(scene.grid.spacing)

@@ -26,13 +26,11 @@ def save_scene(
     method: AbstractIntegrator = Explicit(),
     save_every: int = 1,
 ) -> None:
-    """Write a scene as a TOML file for the shell, editors and `load_scene`, with the particles, which do not know from
-    which regions they were filled, in a run file beside it, `NAME.start.vtkhdf`:
+    """Write a scene as a TOML file for the shell, editors and `load_scene`, with the particles in a run file beside it,
+    `NAME.start.vtkhdf`. Arguments with their default are left out; numbers come back bit for bit.
 
         mpm.save_scene("heap.toml", scene, particles, t1=0.5, dt=1e-3)
         scene, particles, settings = mpm.load_scene("heap.toml")
-
-    Arguments with their default are left out. Numbers come back bit for bit.
 
     Args:
         path: the file to be, NAME.toml, which must not be there.

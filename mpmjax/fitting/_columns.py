@@ -13,8 +13,7 @@ from mpmjax.io import reason
 
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "h": 1e2, "k": 1e3, "M": 1e6, "G": 1e9}
 _UNITS = {prefix + unit: factor for prefix, factor in _PREFIXES.items() for unit in ("m", "s", "N", "Pa", "J")}
-_UNITS |= {prefix + "g": factor * 1e-3 for prefix, factor in _PREFIXES.items()}
-"""Factors to SI units of units with a prefix."""
+_UNITS |= {prefix + "g": factor * 1e-3 for prefix, factor in _PREFIXES.items()}  # factors to SI units
 
 
 class Columns:
@@ -87,8 +86,7 @@ class Columns:
             raise ValueError(f"{self.path}, line {self.lines[wrong[0]]}: {text}")
 
     def scaled(self, name: str, unit: float, key: str = "unit") -> np.ndarray:
-        """A column times `unit`, which the user calls `key`: in SI units. A unit with a prefix in its head, "x [mm]" or
-        "stress_MPa", must be that one."""
+        """A column times `unit`, which the user calls `key`: in SI units, as its head says, if it does: "x [mm]"."""
         stated = stated_unit(name)
         require(
             stated is None or np.isclose(unit, stated, rtol=1e-9),
@@ -96,21 +94,6 @@ class Columns:
             f"give {key} = {stated or 1:g}, or name the column otherwise.",
         )
         return self._data[name] * unit
-
-    def times(self, name: str, unit: float, t1: float, *, grow: bool = True) -> np.ndarray:
-        """The times [s] of a column, which must lie in a run until t1 [s] and, with `grow`, grow from row to row."""
-        times = self.scaled(name, unit, "time_unit")
-        read, advice = (f", with time_unit = {unit:g},", "") if unit != 1 else ("", ", or give time_unit")
-        self.require(times >= 0, f"{name} {{{name}}} lies before the run, which begins at 0: leave the row out.")
-        self.require(
-            ~after(times, t1),
-            f"{name} {{{name}}}{read} lies after the end of the run, t1 = {t1:g} s: raise [run] t1, leave the row out"
-            f"{advice}.",
-        )
-        if grow:
-            steps = np.diff(times, prepend=-np.inf)
-            self.require(steps > 0, f"{name} {{{name}}} must be later than in the row before: sort the rows by time.")
-        return times
 
 
 def after(times: np.ndarray, t1: float) -> np.ndarray:

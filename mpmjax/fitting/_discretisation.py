@@ -8,51 +8,38 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Float
-from mpmjax.fitting._evaluation import parts_kept, residuals_at
-from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._evaluation import residuals_at
+from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._uncertainty import uncertainty
-
-
-def coarsened(experiment: Experiment, longer: int) -> Experiment:
-    """The experiment on twice the spacing, its steps so many times longer, or the next of which t1 is a whole number.
-
-    Raises:
-        ValueError: the coarse grid does not fit a wall that must lie on its nodes, or a period.
-    """
-    scene = eqx.tree_at(lambda s: s.grid, experiment.scene, experiment.scene.grid.coarsened())
-    return replace(experiment, scene=scene, dt=experiment.t1 / -(-experiment.steps // longer))
 
 
 class CoarseGrid(NamedTuple):
     """The look at twice the spacing, and at twice the step there."""
 
-    moved: Float[np.ndarray, "2 n"]
-    """How far the minimum moves on twice the spacing, and from there with twice the step: two numbers, because errors
-    of spacing and step often have opposite signs."""
+    moved: Float[
+        np.ndarray, "2 n"
+    ]  # how far the minimum moves on twice the spacing, and from there with twice the step
     residuals: Float[np.ndarray, "m"]  # those of the minimum on twice the spacing
 
 
-def look_at_coarse_grid(
-    problem: FitProblem, z: Coordinates, sigmas: Sigmas, jacobian: Float[np.ndarray, "m n"]
-) -> CoarseGrid | str:
-    """The look at twice the spacing from the minimum z, or why there is none.
-
-    Gauss-Newton steps −(JᵀJ)⁻¹ Jᵀ r with the residuals r of the coarse grid and the Jacobian of the fine one, three at
-    most of each, while they lower Σ r². What a bound holds has no column in the Jacobian.
-    """
+def look_at_coarse_grid(problem: FitProblem, z: Coordinates, jacobian: Float[np.ndarray, "m n"]) -> CoarseGrid | str:
+    """The look at twice the spacing from the minimum z, or why there is none: by Gauss-Newton steps −(JᵀJ)⁻¹ Jᵀ r with
+    r of the coarse grid and J of the fine one, zero of what a bound holds, at most three of each, while Σ r² falls."""
     inverse = uncertainty(jacobian, float(jnp.finfo(problem.dtype).eps), ()).inverse
     places, first = [np.asarray(z, float)], None
     for longer in (1, 2):
-        try:
-            experiments = tuple(coarsened(e, longer) for e in problem.experiments)
-        except ValueError as error:
+        try:  # steps so many times longer, or the next of which t1 is a whole number
+            scenes = [eqx.tree_at(lambda s: s.grid, e.scene, e.scene.grid.coarsened()) for e in problem.experiments]
+            each = [
+                (e, scene, e.t1 / -(-e.steps // longer)) for e, scene in zip(problem.experiments, scenes, strict=True)
+            ]
+            experiments = tuple(replace(e, scene=scene, dt=dt) for e, scene, dt in each)
+        except ValueError as error:  # of a wall that must lie on nodes, or a period
             return str(error)
         coarse, least, tried = eqx.tree_at(lambda p: p.experiments, problem, experiments), np.inf, places[-1:]
-        kept = parts_kept(coarse, 1)
         for _ in range(_STEPS):
             try:
-                r = np.asarray(residuals_at(coarse, jnp.asarray(tried[-1:], problem.dtype), sigmas, kept), float)[0]
+                r = np.asarray(residuals_at(coarse, np.array(tried[-1:])), float)[0]
             except KeyboardInterrupt:
                 return "interrupted."
             first = r if first is None else first

@@ -122,8 +122,7 @@ def shape_of(r: np.ndarray) -> tuple[float, str]:
 
 def strongest_mode(rows: np.ndarray) -> float:
     """The square of the largest singular value of residuals (f, c) in units of their noise, above the (√f + √c)² that
-    noise has (S. Geman, Ann. Probab. 8 (1980) 252, doi 10.1214/aop/1176994775): how many times the variance of noise
-    an estimate has whose sensitivities are like a discrepancy of that strength."""
+    noise has (S. Geman, Ann. Probab. 8 (1980) 252, doi 10.1214/aop/1176994775)."""
     return float(max(np.linalg.norm(rows, 2) ** 2 - np.sqrt(rows.shape).sum() ** 2, 0.0))
 
 

@@ -38,9 +38,8 @@ class Kept(eqx.Module):
 
 
 def parts_kept(problem: FitProblem, count: int) -> tuple[Kept, ...] | None:
-    """The parts of the states that the observations of each experiment read; None where the residuals are not those of
-    runs, or these parts do not fit into the memory `count` times, as runs or tangents. Residuals are then one program,
-    in which observations are made during the run."""
+    """The parts of the states that the observations of each experiment read; None where they do not fit into the memory
+    `count` times, as runs or tangents, or residuals are not those of runs: these are then one program."""
     if any(getattr(type(problem), name) is not getattr(FitProblem, name) for name in ("jacobian", "residuals")):
         return None
     kept = _kept(problem)
@@ -66,14 +65,12 @@ def _kept(problem: FitProblem) -> tuple[Kept, ...]:
     return tuple(kept)
 
 
-def staged(
-    problem: FitProblem, z: Coordinates, sigmas: Sigmas, kept: tuple[Kept, ...]
-) -> tuple[tuple[Array, Array], tuple[Run, ...]]:
+def staged(problem: FitProblem, z: Coordinates, kept: tuple[Kept, ...]) -> tuple[tuple[Array, Array], tuple[Run, ...]]:
     """`FitProblem.residuals` by forward mode, in three programs, and the runs; `kept` as of `parts_kept`."""
     experiments, of_priors = _put(problem, z)
     each = zip(experiments, kept, strict=True)
     runs = tuple(_run((e.scene, e.particles, e.method), part, e.t1, e.dt) for e, part in each)
-    return _compared(tuple(e.observations for e in experiments), runs, kept, sigmas, of_priors), runs
+    return _compared(tuple(e.observations for e in experiments), runs, kept, problem.sigmas, of_priors), runs
 
 
 @eqx.filter_jit
@@ -122,13 +119,15 @@ class Evaluation(NamedTuple):
     runs: tuple[Run, ...] = ()  # runs of the experiments, where they were a program of their own
 
 
-def evaluated(problem: FitProblem, z: Coordinates, sigmas: Sigmas, kept: tuple[Kept, ...]) -> Evaluation:
-    """Residuals and Jacobian by forward mode, and the runs, without what was observed; `kept` as of `parts_kept`."""
+def evaluated(problem: FitProblem, z: Coordinates) -> Evaluation | None:
+    """Residuals and Jacobian by forward mode, and the runs, without what was observed; None as of `parts_kept`."""
+    if (kept := parts_kept(problem, 1 + problem.size)) is None:
+        return None
     z, rest = jnp.asarray(z, problem.dtype), []
 
     def along(tangent: Any) -> tuple[Any, Any]:
         def residuals(z: Coordinates) -> tuple[Any, Any]:
-            both, runs = staged(problem, z, sigmas, kept)
+            both, runs = staged(problem, z, kept)
             arrays, rest[:] = eqx.partition(tuple(replace(run, observed=None) for run in runs), eqx.is_array)
             return both, arrays
 
@@ -146,33 +145,29 @@ def of_residuals(r: Any, J: Any, room: Array) -> Evaluation:
     return Evaluation((exact**2).sum() / 2, J.T.astype(float) @ exact, r, J, room)
 
 
-def residuals_at(
-    problem: FitProblem, points: Float[Array, "b n"], sigmas: Sigmas, kept: tuple[Kept, ...] | None
-) -> Float[Array, "b m"]:
-    """Residuals at some points together, without derivatives; `kept` as of `parts_kept`."""
+def residuals_at(problem: FitProblem, points: Float[np.ndarray, "b n"]) -> Float[Array, "b m"]:
+    """Residuals at some points together, without derivatives."""
+    kept = parts_kept(problem, len(points))
 
     def one(z: Coordinates) -> Array:
-        return (_residuals(problem, z, sigmas) if kept is None else staged(problem, z, sigmas, kept)[0])[0]
+        return (_residuals(problem, z) if kept is None else staged(problem, z, kept)[0])[0]
 
-    return jax.vmap(one)(points)
+    return jax.vmap(one)(jnp.asarray(points, problem.dtype))
 
 
 def costs_at(
     problem: FitProblem,
     points: Float[np.ndarray, "k n"],
-    sigmas: Sigmas,
     batch: int,
     progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> Float[np.ndarray, "k"]:
-    """½ Σ r² at many points, without derivatives; NaN where a simulation fails. `batch` are computed together, and
-    `progress` is called with how many are done, and of how many."""
-    costs, kept = np.empty(len(points)), parts_kept(problem, min(batch, len(points)))
+    """½ Σ r² at many points, `batch` of them together; NaN where a simulation fails. `progress` as of `search_many`."""
+    costs = np.empty(len(points))
     for first in range(0, len(points), batch):
-        rows = jnp.asarray(points[np.minimum(np.arange(first, first + batch), len(points) - 1)], problem.dtype)
-        r = residuals_at(problem, rows, sigmas, kept)
+        r = residuals_at(problem, points[np.minimum(np.arange(first, first + batch), len(points) - 1)])
         costs[first : first + batch] = (np.asarray(r) ** 2).sum(axis=1)[: len(points) - first] / 2
         progress(min(first + batch, len(points)), len(points))
     return costs
 
 
-_residuals = eqx.filter_jit(lambda problem, z, sigmas: problem.residuals(z, sigmas, diffrax.ForwardMode()))
+_residuals = eqx.filter_jit(lambda problem, z: problem.residuals(z, diffrax.ForwardMode()))

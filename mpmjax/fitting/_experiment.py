@@ -47,22 +47,18 @@ class Shown(eqx.Module):
 
 
 class AbstractObservation(eqx.Module):
-    """A measurement of an experiment.
-
-    One of your own says what it needs of each state (`observe`), and what it would have measured in a run of which it
-    has seen all states (`predict`).
-    """
+    """A measurement of an experiment. One of your own says what it needs of each state (`observe`), and what it would
+    have measured in a run of which it has seen all states (`predict`)."""
 
     data: eqx.AbstractVar[np.ndarray]  # the measured numbers, of any shape; NaN where nothing was measured
-    sigma: eqx.AbstractVar[Float[np.ndarray, "..."] | None]
-    """Standard deviation of its noise, a number or an array that broadcasts against the data, in the data's unit; None
-    to estimate it from the misfit."""
-    weight: eqx.AbstractVar[Scalar]
-    """Factor of its squares [-]: 1 believes the noise, less than 1 counts points whose noise is correlated less."""
-    robust: eqx.AbstractVar[Scalar | None]
-    """The misfit, in standard deviations, beyond which squares grow but linearly (pseudo-Huber), so that outliers count
-    little; None for squares throughout."""
     name: eqx.AbstractVar[str]  # name in tables and pictures
+    sigma: Float[np.ndarray, "..."] | None = eqx.field(converter=as_floats, default=None, kw_only=True)
+    """Standard deviation of its noise, broadcast against the data, in their unit; None to estimate it."""
+    weight: Scalar = eqx.field(converter=as_floats, default=1.0, kw_only=True)
+    """Factor of its squares [-]: 1 believes the noise, less than 1 counts points whose noise is correlated less."""
+    robust: Scalar | None = eqx.field(converter=as_floats, default=None, kw_only=True)
+    """The misfit in σ beyond which squares grow but linearly (pseudo-Huber), for outliers; None for squares alone."""
+    shown: Shown = eqx.field(default=Shown(), kw_only=True)  # how pictures show it, such as in other units
 
     @abc.abstractmethod
     def observe(self, scene: Scene, particles: Particles) -> Any:
@@ -70,8 +66,8 @@ class AbstractObservation(eqx.Module):
 
     @abc.abstractmethod
     def predict(self, seen: Any, run: Run) -> Array:
-        """The measurement that a run predicts, in the shape of the data; NaN where the run does not reach. `seen` is
-        what `observe` returned at the start and after each step, with a leading axis."""
+        """The measurement that a run predicts, in the shape of the data, NaN where it does not reach, from what
+        `observe` returned at the start and after each step, with a leading axis."""
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         """Raise a `ValueError` if the data do not fit this scene and these prepared particles, until t1 [s]."""
@@ -116,11 +112,6 @@ class AbstractObservation(eqx.Module):
         return int(np.isfinite(self.data).sum())
 
     @property
-    def picture(self) -> Shown:
-        """How pictures show it: by `shown`, if it has that field."""
-        return getattr(self, "shown", Shown())
-
-    @property
     def components(self) -> list[tuple[int, str]]:
         """Numbers and names of the components, in C order, of which anything was measured."""
         shape = self.data.shape[1:]
@@ -128,12 +119,12 @@ class AbstractObservation(eqx.Module):
         names = [list(map(str, range(n))) for n in shape]
         if shape and shape[-1] <= 3:
             names[-1] = list("xyz"[: shape[-1]])
-        labels = self.picture.columns or tuple(", ".join(of) for of in itertools.product(*names))
+        labels = self.shown.columns or tuple(", ".join(of) for of in itertools.product(*names))
         return [(k, labels[k]) for k in np.flatnonzero(measured).tolist()]
 
     def draw(self, axis: Any, predicted: Prediction, last: float) -> None:
         """Draw data, fit and bands in the data's units; the data that were fitted end at the abscissa `last`."""
-        shown, (name, against) = self.picture, self.against
+        shown, (name, against) = self.shown, self.against
         order = np.argsort(against)
         x = shown.along(against[order])
 
@@ -264,8 +255,7 @@ class Experiment(eqx.Module):
         return number_of_steps(self.t1, self.dt, 0, self.dtype)
 
     def until(self, t1: float) -> "Experiment":
-        """The experiment, ended at the first step from a time [s] on, with the data until then; itself where there are
-        none, or the time is not before its end. Observations without times, such as a `Curve`, are left out."""
+        """The experiment until the first step from a time [s] on, with the data that have times; itself without any."""
         parts = [o.part_until(t1) for o in self.observations]
         kept = tuple(part for part in parts if part is not None)
         steps = int(np.ceil(t1 / self.dt - _ON_A_STEP))

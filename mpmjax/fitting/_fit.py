@@ -1,7 +1,7 @@
 """Fits of parameters to what was observed: of one data set, or of each of many."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -22,8 +22,8 @@ from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._log import recorded
 from mpmjax.fitting._optimiser import LBFGS, LevenbergMarquardt
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem, Sigmas
-from mpmjax.fitting._result import FitResult, Noise, fit_result, settle_noise
+from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem
+from mpmjax.fitting._result import FitResult, Minimum, fit_result, minimum_of
 from mpmjax.fitting._search import NO_DERIVATIVE, AbstractOptimiser, Iteration, Search, batch_size, counted, search_many
 from mpmjax.fitting._starts import Starts, as_starts, look_around, starting_points, unit_points
 from mpmjax.fitting._uncertainty import seen_together, uncertainty
@@ -60,32 +60,30 @@ def fit(
 
     The least sum of squares of (simulated − measured)/σ over all observations is searched, with derivatives through
     every step and every implicit solve. A σ that is not given is estimated as √(Σ r²/(m − n)), of several observations
-    in rounds. Errors and intervals hold a misfit beyond the noise, those of the noise alone beside them
-    (docs/fitting.md#intervals-that-hold). Ctrl-C ends a fit after the iteration in progress: the best so far is
-    returned, not converged.
+    in rounds. Errors and intervals hold a misfit beyond the noise (docs/fitting.md#intervals-that-hold). Ctrl-C ends a
+    fit after the iteration in progress: the best so far is returned, not converged.
 
     Args:
         experiments: one or several, which share the parameters.
         parameters: what is fitted, by name.
-        starts: from how many points it is searched, or which (`Starts`). "auto": where the misfit of the first search
-            is beyond the noise, 24 more points are looked at, and some searched from, until a misfit is within it;
-            `result.screening` has what they found. 1 searches from the first guess alone.
+        starts: from how many points it is searched, or which (`Starts`), 1 from the first guess alone. "auto": where
+            the misfit of the first search is beyond the noise, 24 more points are looked at, and some searched from,
+            until a misfit is within it (`result.screening`).
         discretisation: whether to look at twice the spacing, and at twice the step there, by three runs each at most,
-            and count as errors how far the minimum moves. What parameters make up for leaves no misfit that tells.
+            and count as errors how far the minimum moves.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
-        optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, with few
-            parameters or few measured numbers, else `LBFGS`.
+        optimiser: the method of the search. Default: `LevenbergMarquardt` with few parameters or few measured numbers,
+            else `LBFGS`.
         memory: for what reverse mode stores, and for the tangents of forward mode that are made at once [B].
         progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`.
-        log: an HDF5 file that holds each iteration (docs/fitting.md) but the one in progress, whatever ends the fit: of
-            the first search, and of the last one from another start.
+        log: an HDF5 file (docs/fitting.md) that holds each iteration that is done, whatever ends the fit: of the first
+            search, and of the last one from another start.
         resume: continue the fit of the log, bit for bit. Only the optimiser's `max_steps` may differ.
 
     Raises:
         ValueError: a parameter that is no number of the experiment, lies outside its bounds or does not influence the
-            data; too few data; data that the simulation does not reach; a log that is there already or, with `resume`,
-            is not, or is of another fit.
+            data; too few data, or data not reached; a log that is there already, with `resume` none or another fit's.
         SimulationError: the simulation at the first guess meets a fault.
         RuntimeError: there is no derivative.
         OSError: the disk refused the log, which holds what it held before.
@@ -100,109 +98,108 @@ def fit(
         require(shape == (), f"What is reported as {name!r} must be one number, got shape {shape}.")
     starts = as_starts(starts)
     starting_points(problem, unit_points(0, problem.size, 0), starts)  # those that cannot be are refused
-    zeros, say, paired = jnp.zeros(problem.size, problem.dtype), progress or (lambda text: None), set[str]()
+    say, alike = progress or (lambda text: None), set[str]()
     with recorded(problem, optimiser, progress, None if log is None else Path(log), resume=resume) as (past, record):
-        rounds, earlier, sigmas, state = (0, (), problem.first_sigmas, None) if past is None else past
 
-        def iterated(noise: Sigmas, search: Search) -> None:
-            """Record an iteration; the first one names what the data do not see, or not apart."""
-            J = search.seen.jacobian
-            first = search.history[-1].number == 0
-            if first:
-                require_influence(problem, noise, search.seen)
-            if first and J is not None and not paired:
-                errors = uncertainty(np.asarray(J, float), float(jnp.finfo(problem.dtype).eps), ())
-                for text in seen_together(problem.labels, errors, problem.logarithmic):
-                    paired.add(text.split(":")[0])
-                    warn(f"At the first guess, {text}")
-                    say(f"at the first guess, {text}")
-            record(noise, search)
-
-        descend = partial(_in_rounds, [problem], optimiser=optimiser, report=iterated)
-
-        def resulted(end: Search, settled: Noise | None) -> FitResult | None:
-            return None if settled is None else fit_result(problem, optimiser, end, settled, report, level)
+        def iterated(problem: FitProblem, search: Search) -> None:
+            if search.history[-1].number == 0:
+                _see(problem, search.seen, alike, say)
+            record(problem, search)
 
         def enough(other: Search) -> bool:
             """Whether a search is at a lower minimum, which the noise explains."""
-            if other.failure or not other.converged or other.joined is not None or not starts.if_needed:
+            if not starts.if_needed or not other.converged or other.joined is not None or other.cost >= end.cost:
                 return False
-            result = None if other.cost >= end.cost else resulted(other, settle_noise(problem, other, noise)[0])
+            result = resulted(minimum_of(minimum.problem, other))
             return result is not None and not result.is_beyond
 
-        ((end, settled, changing, noise),) = descend([sigmas], starts={0: zeros}, rounds=rounds, state=state)
-        result = resulted(end, settled)
+        descend = partial(_in_rounds, optimiser=optimiser, report=iterated)
+        resulted = partial(fit_result, optimiser=optimiser, report=report, level=level)
+        rounds, earlier, latest, state = (0, (), problem, None) if past is None else past
+        (minimum,) = descend([latest], [jnp.zeros(problem.size, problem.dtype)], rounds=rounds, state=state)
+        result, end, screening = resulted(minimum), minimum.search, None
         history = (*earlier, *end.history)
         # The log of a fit that other starts have brought farther holds a search that begins where none ended.
         brought = any(b.number == 0 and not np.array_equal(a.z, b.z) for a, b in pairwise(history))
-        needed = result is not None and result.is_beyond if starts.if_needed else True
-        screening = None
+        needed = not starts.if_needed or (result is not None and result.is_beyond)
         if not end.interrupted and not brought and needed and (starts.count > 1 or starts.points):
             say(f"looking at other starts, {starts.count + len(starts.points)} points")
-            best, screening = look_around(problem, optimiser, starts, end, noise, enough, progress)
+            best, screening = look_around(minimum.problem, optimiser, starts, end, enough, progress)
             if best is not None:
-                ((end, settled, changing, _),) = descend([problem.first_sigmas], starts={0: best.z})
-                result = resulted(end, settled)
+                (minimum,) = descend([problem], [best.z])
+                result, end = resulted(minimum), minimum.search
                 history = (*history, *end.history)
     if result is None:
         require_end(end)
         tried = "" if screening is None else f"No search of {len(screening.searched)} came to a minimum: {end.failure}."
-        problem.explain(zeros, *([tried] if tried else []))
-    if discretisation and settled is not None and not end.interrupted:
+        problem.explain(jnp.zeros(problem.size, problem.dtype), *([tried] if tried else []))
+    if discretisation and not end.interrupted:
         say("looking at twice the spacing")
         free = np.array([not e.at_bound for e in result.estimates])
-        coarse = look_at_coarse_grid(problem, end.z, result.sigmas, result.jacobian * free)
-        result = fit_result(problem, optimiser, end, settled, report, level, coarse)
+        coarse = look_at_coarse_grid(result.problem, end.z, result.jacobian * free)
+        result = resulted(minimum, coarse=coarse) or result
     result = replace(result, history=history, screening=screening)
-    if not result.converged:
-        stopped = "was interrupted" if result.interrupted else "did not converge"
-        advice = " Raise max_steps, start closer, or give a rtol that the precision can reach."
-        if result.interrupted or optimiser.has_stalled(end.inner):
-            advice = ""
-        warn(f"The fit {stopped} after {len(result.history)} iterations: its errors hold only at a minimum.{advice}")
-    elif changing:
-        warn(f"The noise of the observations did not settle in {MOST_ROUNDS} rounds: give the sigma of one of them.")
-    for text in (*result.warnings, *([screening.remark] if screening is not None and screening.remark else [])):
-        if text.split(":")[0] not in paired:
-            warn(text)
+    _warn_of(result, end, moves=minimum.moves, but=alike)
     return result
 
 
+def _see(problem: FitProblem, seen: Evaluation, alike: set[str], say: Callable[[str], None]) -> None:
+    """Refuse parameters that the data do not see at the first guess; warn, once, of those not seen apart, `alike`."""
+    require_influence(problem, seen)
+    if seen.jacobian is None or alike:
+        return
+    errors = uncertainty(np.asarray(seen.jacobian, float), float(jnp.finfo(problem.dtype).eps), ())
+    for text in seen_together(problem.labels, errors, problem.logarithmic):
+        alike.add(text.split(":")[0])
+        warn(f"At the first guess, {text}")
+        say(f"at the first guess, {text}")
+
+
+def _warn_of(result: FitResult, end: Search, *, moves: bool, but: set[str]) -> None:
+    """Warn of a search that did not converge, or whose noise `moves` it, and of what the result says `but` that."""
+    if not result.converged:
+        stopped = "was interrupted" if result.interrupted else "did not converge"
+        advice = " Raise max_steps, start closer, or give a rtol that the precision can reach."
+        if result.interrupted or result.optimiser.has_stalled(end.inner):
+            advice = ""
+        warn(f"The fit {stopped} after {len(result.history)} iterations: its errors hold only at a minimum.{advice}")
+    elif moves:
+        warn(f"The noise of the observations did not settle in {MOST_ROUNDS} rounds: give the sigma of one of them.")
+    remark = "" if result.screening is None else result.screening.remark
+    for text in (*result.warnings, *([remark] if remark else [])):
+        if text.split(":")[0] not in but:
+            warn(text)
+
+
 def chosen_optimiser(problem: FitProblem) -> AbstractOptimiser:
-    """Levenberg-Marquardt while its Jacobian is cheap, with few parameters or measured numbers; else L-BFGS, with more
-    iterations of the same cost for any number of parameters (docs/fitting.md has the measurement)."""
+    """Levenberg-Marquardt while its Jacobian is cheap, else L-BFGS (docs/fitting.md has the measurement)."""
     columns = min(problem.size, ROW_COST * problem.measured)
     return LevenbergMarquardt() if columns <= MOST_COLUMNS else LBFGS()
 
 
 def _in_rounds(
     problems: list[FitProblem],
-    sigmas: list[Sigmas],
+    starts: Sequence[Coordinates],
     *,
-    optimiser: AbstractOptimiser,
-    starts: dict[int, Coordinates],
     rounds: int = 0,
-    state: Search | None = None,
     progress: Callable[[str], None] | None = None,
+    state: Search | None = None,
     **options: Any,
-) -> list[tuple[Search, Noise | None, bool, Sigmas]]:
-    """Searches of each problem, again and again until the noise that it leaves is the noise it was made with: the last
-    search, with all iterations; its noise, None where it failed; whether that still changes the minimum; and the noise
-    it was made with. `state` and `options` as of `search_many`, after so many `rounds`."""
+) -> list[Minimum]:
+    """Searches of each problem, as of `search_many`, until one leaves the noise that it was made with."""
     histories: list[tuple[Iteration, ...]] = [()] * len(problems)
-    outcomes: dict[int, tuple[Search, Noise | None, bool, Sigmas]] = {}
-    while starts:
+    minima, places = dict[int, Minimum](), dict(enumerate(starts))
+    while places:
         told = counted(progress, f"round {rounds + 1}: {{}} of {{}} fits are done")
-        each = list(zip(problems, sigmas, strict=True))
-        ends = search_many(each, optimiser, starts, state=state, progress=told, **options)
-        rounds, starts, state = rounds + 1, {}, None
+        ends = search_many(problems, starts=places, state=state, progress=told, **options)
+        rounds, places, state, problems = rounds + 1, {}, None, list(problems)
         for k, end in ends.items():
             histories[k] += end.history
-            settled, changing = (None, False) if end.failure else settle_noise(problems[k], end, sigmas[k])
-            outcomes[k] = end._replace(history=histories[k]), settled, changing, sigmas[k]
-            if settled is not None and changing and end.converged and rounds < MOST_ROUNDS:
-                starts[k], sigmas[k] = end.z, tuple(sigma for sigma, *_ in settled)
-    return [outcomes[k] for k in range(len(problems))]
+            minima[k] = minimum = minimum_of(problems[k], end._replace(history=histories[k]))
+            if minimum.moves and minimum.noise and end.converged and rounds < MOST_ROUNDS:
+                places[k] = end.z
+                problems[k] = problems[k].with_noise(tuple(sigma for sigma, *_ in minimum.noise))
+    return [minima[k] for k in range(len(problems))]
 
 
 def require_end(end: Search) -> None:
@@ -217,15 +214,15 @@ def require_end(end: Search) -> None:
         )
 
 
-def require_influence(problem: FitProblem, sigmas: Sigmas, seen: Evaluation) -> None:
+def require_influence(problem: FitProblem, seen: Evaluation) -> None:
     """Check that the data depend on every coordinate, at the first guess."""
-    rounding = _ROUNDINGS * float(problem.rounding_of_data(sigmas))
+    rounding = _ROUNDINGS * float(problem.rounding_of_data())
     if seen.jacobian is None:
         # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.
         size = np.abs(np.asarray(seen.gradient)) / max(np.sqrt(2 * float(seen.cost)), np.finfo(float).tiny)
         if (size <= rounding).any():
             # Jᵀw with random numbers w of variance one: the expected square of a component is that of J's column.
-            size = np.abs(np.asarray(_random_pull(problem, jnp.zeros(problem.size, problem.dtype), sigmas)))
+            size = np.abs(np.asarray(_random_pull(problem, jnp.zeros(problem.size, problem.dtype))))
     else:
         size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
     unseen = [label for label, length in zip(problem.labels, size, strict=True) if length <= rounding]
@@ -237,9 +234,9 @@ def require_influence(problem: FitProblem, sigmas: Sigmas, seen: Evaluation) -> 
 
 
 @eqx.filter_jit
-def _random_pull(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Coordinates:
+def _random_pull(problem: FitProblem, z: Coordinates) -> Coordinates:
     """Jᵀw with random numbers w of variance one, by one pass of reverse mode."""
-    r, pull, _ = jax.vjp(lambda z: problem.residuals(z, sigmas, None), z, has_aux=True)
+    r, pull, _ = jax.vjp(lambda z: problem.residuals(z, None), z, has_aux=True)
     return pull(jax.random.normal(jax.random.key(0), r.shape, r.dtype))[0]
 
 
@@ -264,9 +261,9 @@ class EnsembleFit(eqx.Module):
 
     @property
     def alike(self) -> np.ndarray:
-        """Probability of so large a spread of each number if all data sets had one value and the errors are right:
-        Cochran's Q = Σ (z_k − z̄)²/s_k² of the values, of logarithms where none is at zero, χ² of k − 1 degrees of
-        freedom (W. G. Cochran, Biometrics 10 (1954) 101, doi 10.2307/3001666), shape (n,)."""
+        """Probability of so large a spread of each number if all data sets had one value, shape (n,): Cochran's
+        Q = Σ (z_k − z̄)²/s_k² of values, or logarithms, as χ² of k − 1 degrees of freedom (W. G. Cochran, Biometrics 10
+        (1954) 101, doi 10.2307/3001666)."""
         z, s, held = self._columns
         if len(z) < 2:
             return np.full(z.shape[1], np.nan)
@@ -326,8 +323,7 @@ def fit_ensemble(
     Args:
         experiments: the data sets: an experiment each, or several each that share the parameters. They may differ in
             every number, and in no shape, choice or function: give a marker that was not seen as NaN.
-        batch: how many searches run together, see `Starts`.
-        progress: called with a line, such as `print`, as searches end.
+        batch, progress: how many searches run together, see `Starts`; called with a line as they end.
         parameters, report, level, optimiser: see `fit`.
 
     Raises:
@@ -341,17 +337,12 @@ def fit_ensemble(
     problems = [FitProblem(e, parameters) for e in experiments]
     optimiser = chosen_optimiser(problems[0]) if optimiser is None else optimiser
     size = batch_size(problems[0], batch, len(problems))
-    zeros = {k: jnp.zeros(p.size, p.dtype) for k, p in enumerate(problems)}
-    noise = [p.first_sigmas for p in problems]
-    outcomes = _in_rounds(problems, noise, optimiser=optimiser, starts=zeros, progress=progress, batch=size)
-    fits = [
-        None if settled is None else fit_result(problem, optimiser, end, settled, dict(report or {}), float(level))
-        for problem, (end, settled, *_) in zip(problems, outcomes, strict=True)
-    ]
-    failures = {k: end.failure for k, (end, *_) in enumerate(outcomes) if end.failure}
+    zeros = [jnp.zeros(p.size, p.dtype) for p in problems]
+    minima = _in_rounds(problems, zeros, optimiser=optimiser, progress=progress, batch=size)
+    fits = [fit_result(minimum, optimiser, dict(report or {}), float(level)) for minimum in minima]
+    failures = {k: minimum.search.failure for k, minimum in enumerate(minima) if minimum.search.failure}
     if len(failures) == len(fits):
-        z = jnp.zeros(problems[0].size, problems[0].dtype)
-        problems[0].explain(z, failure=f"None of {len(fits)} fits succeeded: {failures[0]}.")
+        problems[0].explain(zeros[0], failure=f"None of {len(fits)} fits succeeded: {failures[0]}.")
     if failures:
         shown = "; ".join(f"number {k}: {why}" for k, why in list(failures.items())[:3])
         warn(f"{len(failures)} of {len(fits)} data sets could not be fitted: {shown}.")
@@ -361,7 +352,6 @@ def fit_ensemble(
     return EnsembleFit(tuple(fits), failures)
 
 
-MOST_COLUMNS = 32
-"""Columns of a Jacobian, or rows at what they cost more, up to which Levenberg-Marquardt is the cheaper."""
+MOST_COLUMNS = 32  # of a Jacobian, or rows at what they cost more, up to which Levenberg-Marquardt is the cheaper
 MOST_ROUNDS = 20  # most re-estimations of the noise
 _ROUNDINGS = 10  # derivatives by a coordinate below so many roundings of the data are none

@@ -27,18 +27,17 @@ import numpy as np
 
 from mpmjax.checks import require
 from mpmjax.fitting._evaluation import Evaluation
-from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas
+from mpmjax.fitting._parameter import AbstractParameter, changes
+from mpmjax.fitting._problem import SHOWN, FitProblem
 from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
 from mpmjax.io import ReplacedFile, check_hdf5, reason, reporting
 
-_FORMAT = 3
+_FORMAT = 4
 _ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), ("accepted", "?"), ("seconds", "f8")]
 _MOST = 8  # numbers of an array that are written out
 _FREE = ("optimiser.max_steps",)  # choices that may differ in a fit that is continued: it may go on for longer
 
-Past = tuple[int, tuple[Iteration, ...], Sigmas, Search]
-"""Number of rounds before the last one, and their iterations; noise of the last one, and its search."""
+Past = tuple[int, tuple[Iteration, ...], FitProblem, Search]  # rounds before the last, their iterations; the last one
 
 
 @contextmanager
@@ -49,132 +48,135 @@ def recorded(
     path: Path | None,
     *,
     resume: bool,
-) -> Iterator[tuple[Past | None, Callable[[Sigmas, Search], None]]]:
-    """The past of a fit that a log holds, if it is to `resume`, and a function that records a search with the noise of
-    its round after each iteration: in the log at this path, by lines of progress, or both."""
-    rows, places, values, noise, past = [], [], [], [], None
+) -> Iterator[tuple[Past | None, Callable[[FitProblem, Search], None]]]:
+    """The past of a fit that a log holds, if it is to `resume`, and a function that records a search, of the problem
+    with the noise of its round, after each iteration: in the log at this path, by lines of progress, or both."""
+    log, past = _Log(problem, {} if path is None else described(problem, optimiser)), None
     with ExitStack() as stack:
+        file = None
         if path is not None:
-            text = described(problem, optimiser)
             if resume:
                 check_hdf5(path)
             file = stack.enter_context(ReplacedFile(path, new=not resume))
             if resume:
-                rows, places, values, noise, past = _read(path, problem, optimiser, text)
+                past = log.read(path, optimiser)
+            else:
+                file.write(log.contents(None))
+            standing = f"{path} holds {{}} iteration{{}}. Resume it to continue.".format
+            stack.enter_context(reporting(lambda: standing(len(log.iterations), "s" * (len(log.iterations) != 1))))
+        begun = time.perf_counter() - (log.iterations[-1][-1] if log.iterations else 0.0)
+        say = None if progress is None else _lines(problem, optimiser, progress, len(log.iterations))
 
-            def write(last: Search | None) -> None:
-                """Write the file; if the disk refuses, the log is what it was."""
-                import h5py  # here, since it takes long to import
-
-                whole = io.BytesIO()
-                with h5py.File(whole, "w", libver=("v110", "v110")) as contents:
-                    attributes = {"kind": np.bytes_("mpmjax fit log"), "version": np.bytes_(version("mpmjax"))}
-                    contents.attrs.update(attributes, format=np.int64(_FORMAT))
-                    arrays = {
-                        "problem": np.frombuffer(json.dumps(text).encode(), np.uint8),
-                        "iterations": np.array(rows, _ROW),
-                        "coordinates": np.array(places).reshape(-1, problem.size),
-                        "values": np.array(values).reshape(-1, problem.size),
-                    }
-                    for k in range(len(problem.observations)):
-                        each = [np.asarray(sigmas[k]) for sigmas in noise]
-                        arrays[f"noise/{k}"] = np.array(each, None if noise else float)
-                    if last is not None:
-                        state = jax.tree.leaves(eqx.filter(last.inner, eqx.is_array))
-                        arrays |= {f"resume/state/{k}": np.asarray(leaf) for k, leaf in enumerate(state)}
-                        seen = {name: a for name, a in last.seen._asdict().items() if a is not None and name != "runs"}
-                        arrays |= {f"resume/seen/{name}": np.asarray(a) for name, a in seen.items()}
-                    for name, array in arrays.items():  # with checksums where there are data
-                        checked = {"chunks": array.shape, "fletcher32": True} if array.ndim and array.size else {}
-                        contents.create_dataset(name, data=array, **checked)
-                    contents["values"].attrs["labels"] = json.dumps(problem.labels)
-                    for k, observation in enumerate(problem.observations):
-                        contents[f"noise/{k}"].attrs["name"] = observation.name
-                data = whole.getvalue()
+        def record(problem: FitProblem, search: Search) -> None:
+            seconds = time.perf_counter() - begun
+            if file is not None:
+                log.add(problem, search.history[-1], seconds)
                 try:
-                    file.write(data + zlib.crc32(data).to_bytes(4))
+                    file.write(log.contents(search))
                 except OSError as error:
                     raise OSError(f"{error} If it has no room, make room, then resume the fit.") from None
-
-            if not resume:
-                write(None)
-            stack.enter_context(
-                reporting(lambda: f"{path} holds {len(rows)} iteration{'s' * (len(rows) != 1)}. Resume it to continue.")
-            )
-        begun = time.perf_counter() - (rows[-1][-1] if rows else 0.0)
-        say = None if progress is None else _lines(problem, optimiser, progress, len(rows))
-
-        def record(sigmas: Sigmas, search: Search) -> None:
-            iteration, seconds = search.history[-1], time.perf_counter() - begun
-            if path is not None:
-                if iteration.number == 0:
-                    noise.append(sigmas)
-                rows.append((len(noise) - 1, *iteration[:4], seconds))
-                places.append(iteration.z)
-                values.append(np.asarray(problem.numbers(jnp.asarray(iteration.z, problem.dtype)), float))
-                write(search)
             if say is not None:
                 say(search, seconds)
 
         yield past, record
 
 
-def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: dict[str, str]) -> tuple[Any, ...]:
-    """Rows, coordinates and values of the iterations in a log, which must be whole and of the same fit, the noise of
-    its rounds, and the past of the fit."""
-    import h5py
+class _Log:
+    """The content of a log: iterations with the number of their round and seconds, their values, noise of rounds."""
 
-    damaged = f"{path} is damaged ({{}}): begin the fit anew with another log."
-    try:
-        data = path.read_bytes()
-        with h5py.File(io.BytesIO(data), "r") as file:
-            is_log = file.attrs.get("kind") == b"mpmjax fit log"
-            layout = int(np.asarray(file.attrs["format"])) if is_log else 0
-            whole = zlib.crc32(data[:-4]) == int.from_bytes(data[-4:])
-            require(whole or layout != _FORMAT, "it is not what was written")
-            datasets: list[Any] = []
-            file.visititems(lambda _, item: datasets.append(item) if isinstance(item, h5py.Dataset) else None)
-            arrays = {item.name.lstrip("/"): np.asarray(item[()]) for item in datasets if whole}
-        theirs = json.loads(arrays["problem"].tobytes()) if layout == _FORMAT else {}
-    except (OSError, KeyError, ValueError, RuntimeError, MemoryError) as error:
-        raise ValueError(damaged.format(reason(error))) from None
-    require(is_log, f"{path} is not the log of a fit: check its name.")
-    require(layout == _FORMAT, f"{path} is a log of format {layout}, this mpmjax reads {_FORMAT}: begin the fit anew.")
-    for name in (*theirs, *text):
-        here, there = text.get(name, "none"), theirs.get(name, "none")
-        require(
-            here == there,
-            f"{path} is the log of another fit: {name} is {there} there and {here} here. Resume the same fit, or name "
-            "a new log.",
-        )
-    try:
+    def __init__(self, problem: FitProblem, text: dict[str, str]):
+        self.problem, self.text = problem, text
+        self.iterations, self.values, self.noise = list[tuple[int, Iteration, float]](), list[np.ndarray](), list[Any]()
+
+    def add(self, problem: FitProblem, iteration: Iteration, seconds: float) -> None:
+        """Add an iteration, with the noise of its round if it is the first one."""
+        if iteration.number == 0:
+            self.noise.append(problem.sigmas)
+        self.iterations.append((len(self.noise) - 1, iteration, seconds))
+        self.values.append(np.asarray(problem.numbers(jnp.asarray(iteration.z, problem.dtype)), float))
+
+    def contents(self, last: Search | None) -> bytes:
+        """The file, with what the next iteration needs of the `last` search."""
+        import h5py  # here, since it takes long to import
+
+        size, observations, whole = self.problem.size, self.problem.observations, io.BytesIO()
+        arrays = {
+            "problem": np.frombuffer(json.dumps(self.text).encode(), np.uint8),
+            "iterations": np.array([(n, *i[:4], seconds) for n, i, seconds in self.iterations], _ROW),
+            "coordinates": np.array([i.z for _, i, _ in self.iterations]).reshape(-1, size),
+            "values": np.array(self.values).reshape(-1, size),
+        }
+        for k in range(len(observations)):
+            each = [np.asarray(sigmas[k]) for sigmas in self.noise]
+            arrays[f"noise/{k}"] = np.array(each, None if each else float)
+        if last is not None:
+            state = jax.tree.leaves(eqx.filter(last.inner, eqx.is_array))
+            arrays |= {f"resume/state/{k}": np.asarray(leaf) for k, leaf in enumerate(state)}
+            seen = {name: a for name, a in last.seen._asdict().items() if a is not None and name != "runs"}
+            arrays |= {f"resume/seen/{name}": np.asarray(a) for name, a in seen.items()}
+        with h5py.File(whole, "w", libver=("v110", "v110")) as file:
+            attributes = {"kind": np.bytes_("mpmjax fit log"), "version": np.bytes_(version("mpmjax"))}
+            file.attrs.update(attributes, format=np.int64(_FORMAT))
+            for name, array in arrays.items():
+                file[name] = array
+            file["values"].attrs["labels"] = json.dumps(self.problem.labels)
+            for k, observation in enumerate(observations):
+                file[f"noise/{k}"].attrs["name"] = observation.name
+        data = whole.getvalue()
+        return data + zlib.crc32(data).to_bytes(4)
+
+    def read(self, path: Path, optimiser: AbstractOptimiser) -> Past | None:
+        """Take what a file holds, which must be whole and the log of the same fit; the past of the fit."""
+        import h5py
+
+        damaged, arrays = f"{path} is damaged ({{}}): begin the fit anew with another log.", dict[str, np.ndarray]()
+        try:
+            data = path.read_bytes()
+            with h5py.File(io.BytesIO(data), "r") as file:
+                is_log = file.attrs.get("kind") == b"mpmjax fit log"
+                layout = int(np.asarray(file.attrs["format"])) if is_log else 0
+                whole = zlib.crc32(data[:-4]) == int.from_bytes(data[-4:])
+                require(whole or layout != _FORMAT, "it is not what was written")
+
+                def read(name: str, item: Any) -> None:
+                    if isinstance(item, h5py.Dataset):
+                        arrays[name] = np.asarray(item[()])
+
+                if whole:
+                    file.visititems(read)
+            theirs = json.loads(arrays["problem"].tobytes()) if layout == _FORMAT else {}
+        except (OSError, KeyError, ValueError, RuntimeError, MemoryError) as error:
+            raise ValueError(damaged.format(reason(error))) from None
+        require(is_log, f"{path} is not the log of a fit: check its name.")
+        this = f"this mpmjax reads {_FORMAT}: begin the fit anew."
+        require(layout == _FORMAT, f"{path} is a log of format {layout}, {this}")
+        for name in (*theirs, *self.text):
+            here, there = self.text.get(name, "none"), theirs.get(name, "none")
+            differs = f"{name} is {there} there and {here} here. Resume the same fit, or name a new log."
+            require(here == there, f"{path} is the log of another fit: {differs}")
+        try:
+            return self._past(arrays, optimiser)
+        except (KeyError, IndexError, TypeError) as error:
+            raise ValueError(damaged.format(reason(error))) from None
+
+    def _past(self, arrays: dict[str, np.ndarray], optimiser: AbstractOptimiser) -> Past | None:
         rows: list[Any] = arrays["iterations"].tolist()
-        places, past = list(arrays["coordinates"]), None
-        rounds, observations = rows[-1][0] + 1 if rows else 0, range(len(problem.observations))
-        noise = [tuple(jnp.asarray(arrays[f"noise/{k}"][n]) for k in observations) for n in range(rounds)]
-        if rows:
-            each: Any = [(n, Iteration(*i, z)) for (n, *i, _), z in zip(rows, places, strict=True)]  # pyright: ignore
-            earlier, history = (tuple(i for n, i in each if (n == rounds - 1) is last) for last in (False, True))
-            names = [name for name in Evaluation._fields if f"resume/seen/{name}" in arrays]
-            parts: dict[str, Any] = {name: arrays[f"resume/seen/{name}"] for name in names}
-            seen = Evaluation(**parts)
-            like = eqx.filter_eval_shape(optimiser.begin, problem, jnp.zeros(problem.size), noise[-1])
-            shapes, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
-            leaves, tree = jax.tree.flatten(shapes)
-            state = []
-            for k, leaf in enumerate(leaves):
-                data = arrays[f"resume/state/{k}"]
-                if (data.shape, data.dtype) != (leaf.shape, leaf.dtype):
-                    raise TypeError(
-                        f"the optimiser remembers {leaf.shape} of {leaf.dtype}, not {data.shape} of {data.dtype}"
-                    )
-                # As weakly typed as it was, or the next iteration would compile anew.
-                state.append(jnp.asarray(data.item() if leaf.weak_type and data.ndim == 0 else data))
-            inner = eqx.combine(jax.tree.unflatten(tree, state), rest)
-            past = rounds - 1, earlier, noise[-1], Search(jnp.asarray(places[-1]), inner, seen, history)
-        return rows, places, list(arrays["values"]), noise, past
-    except (KeyError, IndexError, TypeError) as error:
-        raise ValueError(damaged.format(reason(error))) from None
+        each = zip(rows, arrays["coordinates"], strict=True)
+        self.iterations = [(n, Iteration(*i, z), seconds) for (n, *i, seconds), z in each]  # pyright: ignore
+        if not rows:
+            return None
+        last, observations = rows[-1][0], range(len(self.problem.observations))
+        self.values = list(arrays["values"])
+        self.noise = [tuple(jnp.asarray(arrays[f"noise/{k}"][n]) for k in observations) for n in range(last + 1)]
+        earlier, history = (tuple(i for n, i, _ in self.iterations if (n == last) is now) for now in (False, True))
+        parts: dict[str, Any] = {name.rpartition("/")[2]: a for name, a in arrays.items() if "/seen/" in name}
+        like = eqx.filter_eval_shape(optimiser.begin, self.problem, jnp.zeros(self.problem.size))
+        shapes, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
+        leaves, tree = jax.tree.flatten(shapes)
+        state = [jnp.asarray(arrays[f"resume/state/{k}"]) for k in range(len(leaves))]
+        inner = eqx.combine(jax.tree.unflatten(tree, state), rest)
+        search = Search(jnp.asarray(history[-1].z), inner, Evaluation(**parts), history)
+        return last, earlier, self.problem.with_noise(self.noise[-1]), search
 
 
 def described(problem: FitProblem, optimiser: AbstractOptimiser) -> dict[str, str]:
@@ -185,14 +187,8 @@ def described(problem: FitProblem, optimiser: AbstractOptimiser) -> dict[str, st
         texts |= dict(_texts(experiment, f"experiments.{k}"))
     for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
         experiment = problem.experiments[0 if parameter.only is None else parameter.only[0]]
-        put = parameter.put(experiment, start + 1 + jnp.abs(start))
-        before, after = (jax.tree_util.tree_leaves_with_path(tree) for tree in (experiment, put))
-        changed = [
-            jax.tree_util.keystr(path).lstrip(".")
-            for (path, a), (_, b) in zip(before, after, strict=False)
-            if eqx.is_array_like(a) and not np.array_equal(a, b)
-        ]
-        texts[f"parameters.{name}"] = f"{type(parameter).__name__} of {', '.join(changed)}"
+        changed = ", ".join(changes(parameter, experiment, np.asarray(start)))
+        texts[f"parameters.{name}"] = f"{type(parameter).__name__} of {changed}"
         texts |= dict(_texts(parameter, f"parameters.{name}"))
     return {name: text for name, text in texts.items() if name not in _FREE}
 
@@ -253,13 +249,9 @@ def _digest(data: bytes) -> str:
 def _lines(
     problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None], done: int
 ) -> Callable[[Search, float], None]:
-    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left of the present search.
-    The first one says that an iteration is compiled; `done` are in the log.
-
-    The time left is the median time of an iteration times how many are left: about so many as the optimiser's distance
-    from converged needs to fall to one, where it falls; else at most those up to `max_steps`. It is not said while only
-    the iteration that was compiled is timed, and at the end.
-    """
+    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left of the present search,
+    after a first one that an iteration is compiled; `done` are in the log. The time left is the median time of an
+    iteration times how many the optimiser's distance from converged needs to fall to one, or all up to `max_steps`."""
     durations, distances, last = list[float](), list[float](), time.perf_counter()
     labels = ", ".join(problem.labels[:SHOWN]) + (", …" if problem.size > SHOWN else "")
     after = f" after {done} iterations of the log" if done else ""

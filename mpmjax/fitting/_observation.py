@@ -10,22 +10,13 @@ import numpy as np
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import as_floats, require, require_fields, require_finite
 from mpmjax.fitting._columns import ROUNDED, after
-from mpmjax.fitting._experiment import AbstractObservation, Shown
+from mpmjax.fitting._experiment import AbstractObservation
 from mpmjax.fitting._quantities import Markers
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene
 
 
-class _Measured(AbstractObservation):
-    """A measurement whose noise and weight are as `Series` says."""
-
-    sigma: Float[np.ndarray, "..."] | None = eqx.field(converter=as_floats, default=None, kw_only=True)
-    weight: Scalar = eqx.field(converter=as_floats, default=1.0, kw_only=True)
-    robust: Scalar | None = eqx.field(converter=as_floats, default=None, kw_only=True)
-    shown: Shown = eqx.field(default=Shown(), kw_only=True)
-
-
-class Curve(_Measured):
+class Curve(AbstractObservation):
     """A quantity measured against another one: stress against stretch, a force against a displacement.
 
     Args:
@@ -83,7 +74,7 @@ class Curve(_Measured):
         return (measured < x[0] - slack) | (measured > x[-1] + slack)
 
 
-class AbstractTimed(_Measured):
+class AbstractTimed(AbstractObservation):
     """A measurement against time; between steps it is interpolated linearly."""
 
     times: Float[np.ndarray, "f"] = eqx.field(converter=as_floats)
@@ -105,8 +96,7 @@ class AbstractTimed(_Measured):
         return "time [s]", self.times
 
     def predict(self, seen: Any, run: Run, first: Scalar = 0.0) -> Array:
-        """Values at the times, from those `seen` of all steps, shape (k, ...), the first of which is `first` steps from
-        the start; NaN at times that a parameter has moved out of the run."""
+        """Values at the times, from those of steps, shape (k, ...), from `first` on; NaN where a time left the run."""
         step = jnp.asarray(self.times, seen.dtype) / run.dt
         outside = (step < -_BEYOND) | (step > (len(run.steps) - 1) * (1 + ROUNDED) + _BEYOND)
         outside = outside.reshape(-1, *[1] * (seen.ndim - 1))
@@ -200,9 +190,8 @@ class Tracks(AbstractTimed):
 
 
 class Force(AbstractTimed):
-    """The force on a collider, such as a plate on which a body falls, or on any boundary, against time.
-
-    Compared with the force of each step at its own time (see `Forces`), interpolated linearly.
+    """The force on a collider, such as a plate on which a body falls, or on any boundary, against time: compared with
+    that of each step at its own time (see `Forces`), interpolated linearly.
 
     Args:
         times: when it was measured [s], shape (f,), growing.

@@ -1,5 +1,4 @@
-"""Methods that search the least sum of squares: Levenberg-Marquardt by residuals and their Jacobian, L-BFGS and Adam of
-optax by the gradient alone."""
+"""Methods that search the least Σ r²: Levenberg-Marquardt by the Jacobian, L-BFGS and Adam of optax by the gradient."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +13,7 @@ import optax
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import as_floats, positive, require_fields, require_positive, tolerance, whole
 from mpmjax.fitting._evaluation import Evaluation, of_residuals
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._search import AbstractOptimiser, Search
 
 
@@ -24,46 +23,41 @@ class LevenbergMarquardt(AbstractOptimiser):
     λ is first one, the square of a coordinate's natural step; it falls by 3.5 where a step lowers Σ r² as foretold, and
     grows fourfold where one does not lower it by a hundredth of that, or a simulation fails: that one is not taken. It
     is larger where a number with a bound would move by more than 2 in its coordinate, a modulus sevenfold, or a quarter
-    of that for each refusal before: so far no straight line knows the way. From the second refusal on the next step is
-    a quarter of the refused one at most, and half of one that brought less than a quarter of what was foretold. Near a
-    bound, which hides the value from its coordinate, damping holds a step that the data ask for: there the next one is
-    the Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds.
+    of that for each refusal before. From the second refusal on a step is a quarter of the refused one at most, and half
+    of one that brought less than a quarter of what was foretold. Near a bound, which hides the value from its
+    coordinate, damping holds a step that the data ask for: there the next one is the Gauss-Newton step of values that
+    follow their coordinates in straight lines up to their bounds.
 
     It ends where a step changes nothing by more than the tolerance, where the next Gauss-Newton step, no longer than to
     a bound, is less than a ten-thousandth of the standard error that the misfit gives, or where one is refused and
     could lower Σ r² by no more than its rounding, or a hundredth of the variance σ² = Σ r²/(m − n). Where six
     iterations, half of them refused, lower it by less than a tenth of σ² or a ten-thousandth, and move no coordinate by
-    more than 0.03, or only steps far shorter than the Gauss-Newton step are taken, the misfit has a kink or simulations
-    fail beyond: it ends, and has not converged.
+    more than 0.03, or steps are far shorter than Gauss-Newton's, the misfit has a kink or simulations fail beyond: it
+    ends, and has not converged.
 
     Args:
         rtol: relative and absolute tolerance of coordinates and residuals.
         max_steps: most iterations.
-        mode: of the Jacobian: "forward", by a tangent a coordinate beside the simulation; "reverse", by a pass back a
-            measured number. Default: the cheaper one.
+        mode: of the Jacobian, see `FitProblem.jacobian`. Default: the cheaper one.
     """
 
     rtol: Annotated[Scalar, tolerance] = 1e-6
     max_steps: Annotated[int, whole(1)] = eqx.field(static=True, default=300)
     mode: Literal["forward", "reverse"] | None = eqx.field(static=True, default=None)
 
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "DampedState":
+    def begin(self, problem: FitProblem, z: Coordinates) -> "DampedState":
         no = jnp.asarray(False)
-        return DampedState(z, jnp.ones((), z.dtype), jnp.zeros((), jnp.int32), no, no)
+        return DampedState(z, z, jnp.ones((), z.dtype), jnp.zeros((), jnp.int32), no, no)
 
     def place(self, problem: FitProblem, state: "DampedState") -> Coordinates | None:
         return state.trial if (self.mode or problem.cheaper_mode) == "forward" else None
 
-    def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "DampedState"
-    ) -> tuple[Coordinates, "DampedState", Evaluation]:
+    def iterate(self, problem: FitProblem, state: "DampedState") -> tuple["DampedState", Evaluation]:
         z = state.trial.astype(problem.dtype)
-        return state.trial, state, of_residuals(*problem.jacobian(z, sigmas, self.mode), problem.room(z))
+        return state, of_residuals(*problem.jacobian(z, self.mode), problem.room(z))
 
-    def directed(
-        self, before: Search, z: Coordinates, state: "DampedState", seen: Evaluation
-    ) -> tuple[Coordinates, "DampedState", Evaluation]:
-        reach, refused, longest, settled, stalled = float(state.reach), 0, np.inf, False, False
+    def directed(self, before: Search, state: "DampedState", seen: Evaluation) -> tuple["DampedState", Evaluation]:
+        z, reach, refused, longest, settled, stalled = state.trial, float(state.reach), 0, np.inf, False, False
         if before.history:
             last, tried, moved = _Lines.at(before.seen), _Lines.at(seen), np.asarray(z - before.z, float)
             gain = _gain(last, tried, moved)
@@ -78,7 +72,7 @@ class LevenbergMarquardt(AbstractOptimiser):
             stalled = _leads_nowhere(before, z, last, min(tried.square, last.square))
         lines = _Lines.at(seen)
         if not np.isfinite(lines.J).all():
-            return z, state, seen
+            return state._replace(z=z), seen
         bent = np.isfinite(lines.room).any(axis=0)  # coordinates of numbers with a bound
         step = _damped(lines, reach, np.minimum(np.where(bent, _FURTHEST / _SHORTER**refused, np.inf), longest))
         newton, limited = lines.gauss_newton()
@@ -88,8 +82,8 @@ class LevenbergMarquardt(AbstractOptimiser):
         straight = _beside_a_bound(lines, newton / _SHORTER**refused, step, not refused and np.isinf(longest))
         if straight is not None:
             step, reach = straight, reach * _SHORTER  # if it is refused, damping is as if it had not been tried
-        after = np.asarray(z, float) + step, reach, refused, over and not held, over and held
-        return z, DampedState(*(jnp.asarray(a, leaf.dtype) for a, leaf in zip(after, state, strict=True))), seen
+        after = z, np.asarray(z, float) + step, reach, refused, over and not held, over and held
+        return DampedState(*(jnp.asarray(a, leaf.dtype) for a, leaf in zip(after, state, strict=True))), seen
 
     def has_converged(self, state: "DampedState", seen: Evaluation) -> bool:
         if state.settled or self.distance(state, seen) <= 1:
@@ -115,6 +109,7 @@ class LevenbergMarquardt(AbstractOptimiser):
 class DampedState(NamedTuple):
     """State of Levenberg-Marquardt."""
 
+    z: Coordinates  # where it is
     trial: Coordinates  # where it looks next
     reach: Float[Array, ""]  # one over the damping
     refused: Int[Array, ""]  # how many steps in a row were refused
@@ -149,8 +144,8 @@ class _Lines(NamedTuple):
         return ((self.r + self.J @ step) ** 2).sum()
 
     def gauss_newton(self) -> tuple[np.ndarray, np.ndarray]:
-        """The next Gauss-Newton step, were values straight lines in their coordinates up to their bounds, NaN if it is
-        unknown, and which coordinates it brings to a bound."""
+        """The Gauss-Newton step of values that are straight lines up to their bounds, NaN if not known, and which are
+        brought to one."""
         r, J, room = self
         if not (np.isfinite(r).all() and np.isfinite(J).all()):
             return np.full(J.shape[1], np.nan), np.zeros(J.shape[1], bool)
@@ -210,13 +205,11 @@ def _beside_a_bound(lines: _Lines, step: np.ndarray, damped: np.ndarray, surely:
 class LBFGS(AbstractOptimiser):
     """The limited-memory BFGS method of optax with its zoom line search, on gradients by reverse mode.
 
-    An iteration is a line search: mostly one simulation with its gradient, whatever the number of parameters. The first
-    step is of length one at most. Where a simulation or its derivative fails the cost is infinite. A line search that
-    finds nothing lower is begun again along the negative gradient; where that finds nothing either, the search ends,
-    and has not converged.
-
-    It ends where two line searches in a row bring the cost, ½ Σ r², less than `rtol`² σ² lower, foreseen and done,
-    σ² = Σ r²/(m − n): some `rtol` standard errors from the minimum. Or where rounding hides what they bring.
+    An iteration is a line search: mostly one simulation with its gradient, whatever the number of parameters. Where a
+    simulation or its derivative fails the cost is infinite. A line search that finds nothing lower is begun again along
+    the negative gradient; where that finds nothing either, the search ends, and has not converged. It has where two in
+    a row bring the cost, ½ Σ r², less than `rtol`² σ² lower, foreseen and done, σ² = Σ r²/(m − n): some `rtol` standard
+    errors from the minimum; or where rounding hides what they bring.
 
     Args:
         rtol: distance from the minimum at which it ends, in standard errors.
@@ -230,30 +223,26 @@ class LBFGS(AbstractOptimiser):
     memory: Annotated[int, whole(1)] = eqx.field(static=True, default=20)
     line_search: Annotated[int, whole(1)] = eqx.field(static=True, default=20)
 
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "LBFGSState":
+    def begin(self, problem: FitProblem, z: Coordinates) -> "LBFGSState":
         no, zero, none = jnp.asarray(False), jnp.zeros((), z.dtype), jnp.zeros((), jnp.int32)
         past: Any = optax.scale_by_lbfgs(self.memory).init(z)
-        return LBFGSState(no, zero, jnp.zeros_like(z), past, zero + jnp.inf, zero, none, no)
+        return LBFGSState(z, no, zero, jnp.zeros_like(z), past, zero + jnp.inf, zero, none, no)
 
-    def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "LBFGSState"
-    ) -> tuple[Coordinates, "LBFGSState", Evaluation]:
-        def start(z: Coordinates, state: LBFGSState) -> tuple[Coordinates, LBFGSState]:
-            _, cost, gradient = problem.gradient(z, sigmas)
-            return z, state._replace(begun=~state.begun, cost=cost, gradient=gradient)
+    def iterate(self, problem: FitProblem, state: "LBFGSState") -> tuple["LBFGSState", Evaluation]:
+        def start(state: LBFGSState) -> LBFGSState:
+            _, cost, gradient = problem.gradient(state.z)
+            return state._replace(begun=~state.begun, cost=cost, gradient=gradient)
 
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers
-            z, state = jax.lax.cond(state.begun, partial(self._search, problem, sigmas), start, z, state)
-        return z, state, Evaluation(state.cost, state.gradient)
+            state = jax.lax.cond(state.begun, partial(self._search, problem), start, state)
+        return state, Evaluation(state.cost, state.gradient)
 
     def has_converged(self, state: "LBFGSState", seen: Evaluation) -> bool:
         return bool((state.small > 1) | (state.stalled & (state.predicted_decrease <= state.decrease_tolerance)))
 
-    def _search(
-        self, problem: FitProblem, sigmas: Sigmas, z: Coordinates, state: "LBFGSState"
-    ) -> tuple[Coordinates, "LBFGSState"]:
+    def _search(self, problem: FitProblem, state: "LBFGSState") -> "LBFGSState":
         """A line search along the quasi-Newton direction, or where nothing is known yet along the negative gradient."""
-        cost, gradient = state.cost, state.gradient
+        z, cost, gradient = state.z, state.cost, state.gradient
         quasi_newton: Any = optax.scale_by_lbfgs(self.memory)
         fresh = quasi_newton.init(z)
         newton, steepest = (quasi_newton.update(gradient, past, z) for past in (state.past, fresh))
@@ -261,12 +250,12 @@ class LBFGS(AbstractOptimiser):
         along, past = _where(steep, steepest, newton)
         predicted_decrease = jnp.where(steep, jnp.minimum(state.predicted_decrease, gradient @ along), gradient @ along)
         # The part of the cost that may be rounding: each residual has that of the data, ε √Σ (data/σ)².
-        rounding = problem.rounding_of_data(sigmas).astype(cost.dtype)
+        rounding = problem.rounding_of_data().astype(cost.dtype)
         slack = jnp.sqrt(2 * cost) * rounding + rounding**2 + float(jnp.finfo(cost.dtype).eps) * cost
 
         def evaluate(z: Coordinates) -> tuple[Array, Coordinates]:
             """The cost and its derivative; infinite where either fails."""
-            _, cost, gradient = problem.gradient(z, sigmas)
+            _, cost, gradient = problem.gradient(z)
             usable = jnp.isfinite(cost) & jnp.isfinite(gradient).all()
             return jnp.where(usable, cost, jnp.inf), jnp.where(usable, gradient, 0)
 
@@ -279,6 +268,7 @@ class LBFGS(AbstractOptimiser):
         decrease_tolerance = jnp.maximum(jnp.asarray(self.rtol, z.dtype) ** 2 * (2 * cost / freedom), slack)
         small = moved & (predicted_decrease <= decrease_tolerance) & (cost - at_end.value <= decrease_tolerance)
         after = LBFGSState(
+            z=z + step,
             begun=state.begun,
             cost=at_end.value,
             gradient=at_end.grad,
@@ -288,13 +278,13 @@ class LBFGS(AbstractOptimiser):
             small=jnp.where(small, state.small + 1, 0),
             stalled=~moved & steep,
         )
-        stayed = after._replace(cost=cost, gradient=gradient, past=fresh)
-        return _where(moved, (z + step, after), (z, stayed))
+        return _where(moved, after, after._replace(z=z, cost=cost, gradient=gradient, past=fresh))
 
 
 class LBFGSState(NamedTuple):
     """State of L-BFGS."""
 
+    z: Coordinates  # where it is
     begun: Bool[Array, ""]  # whether the cost is known where it is
     cost: Float[Array, ""]
     gradient: Coordinates
@@ -347,20 +337,18 @@ class Adam(AbstractOptimiser):
         """The learning rate of an iteration, before any halving."""
         return self.learning_rate(number) if callable(self.learning_rate) else self.learning_rate
 
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "AdamState":
+    def begin(self, problem: FitProblem, z: Coordinates) -> "AdamState":
         one, zero, rate = jnp.ones((), z.dtype), jnp.zeros((), jnp.int32), jnp.asarray(self.rate(0), z.dtype)
-        return AdamState(zero, z, _MOMENTS.init(z), one * jnp.inf, jnp.zeros_like(z), one, rate, zero)
+        return AdamState(z, zero, z, _MOMENTS.init(z), one * jnp.inf, jnp.zeros_like(z), one, rate, zero)
 
-    def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "AdamState"
-    ) -> tuple[Coordinates, "AdamState", Evaluation]:
-        _, cost, gradient = problem.gradient(state.trial, sigmas)
+    def iterate(self, problem: FitProblem, state: "AdamState") -> tuple["AdamState", Evaluation]:
+        _, cost, gradient = problem.gradient(state.trial)
         first = state.number == 0
         usable = jnp.isfinite(cost) & jnp.isfinite(gradient).all()
         lower = usable & (cost < state.cost)
         fruitless = jnp.where(lower, 0, state.fruitless + 1)
         back = ~usable | (fruitless >= self.patience)
-        z, best, slope = _where(lower | first, (state.trial, cost, gradient), (z, state.cost, state.gradient))
+        z, best, slope = _where(lower | first, (state.trial, cost, gradient), (state.z, state.cost, state.gradient))
 
         anew = z, slope, _MOMENTS.init(z)
         start, from_here, moments = _where(back, anew, (state.trial, gradient, state.moments))
@@ -369,6 +357,7 @@ class Adam(AbstractOptimiser):
         factor = jnp.where(back, state.factor / 2, state.factor)
         step = factor * jnp.asarray(self.rate(state.number), z.dtype)
         after = AdamState(
+            z=z,
             number=state.number + 1,
             trial=start - step * direction,
             moments=moments,
@@ -378,7 +367,7 @@ class Adam(AbstractOptimiser):
             step=step,
             fruitless=jnp.where(back, 0, fruitless),
         )
-        return z, after, Evaluation(best, slope)
+        return after, Evaluation(best, slope)
 
     def has_converged(self, state: "AdamState", seen: Evaluation) -> bool:
         return bool(state.step < self.atol)
@@ -387,6 +376,7 @@ class Adam(AbstractOptimiser):
 class AdamState(NamedTuple):
     """State of Adam."""
 
+    z: Coordinates  # where it is, the best place
     number: Int[Array, ""]  # how many simulations there were
     trial: Coordinates  # where the next one is
     moments: optax.ScaleByAdamState  # means of gradients and of their squares

@@ -39,8 +39,7 @@ class AbstractPrior(eqx.Module):
 
     @abc.abstractmethod
     def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
-        """The residuals [-], shape (k,), of the value in its unit and, of the same shape, in a measure without bounds
-        (see `AbstractParameter.free`)."""
+        """The residuals [-], shape (k,), of the value in its unit and, in its shape, `AbstractParameter.free` of it."""
 
     @abc.abstractmethod
     def check(self, name: str, shape: tuple[int, ...]) -> None:
@@ -87,11 +86,9 @@ class Gaussian(AbstractPrior):
 
 
 class Smooth(AbstractPrior):
-    """Prior knowledge of a field: neighbours differ little, by a normal distribution of mean zero.
-
-    Neighbours are entries next to each other along an axis of the parameter, which is an array: the nodes of a `Field`,
-    or a history in time. The difference is that of logarithms of a `Positive` parameter, of logits of a `Bounded` one,
-    of values of an `Unbounded` one. The mean level is left free.
+    """Prior knowledge of a field: neighbours along its axes, nodes of a `Field` or times of a history, differ little by
+    a normal distribution of mean zero: logarithms of a `Positive` parameter, logits of a `Bounded` one, values of an
+    `Unbounded` one. The mean level is left free.
 
     Args:
         sigma: standard deviation of the difference of two neighbours, 0.1 of a `Positive` parameter for about 10 %. On
@@ -184,8 +181,7 @@ class AbstractParameter(eqx.Module):
         """Raise a `ValueError` if it cannot be put into an experiment."""
 
     def room(self, start: Value, z: Value) -> tuple[Value, Value]:
-        """How far the value can fall and rise until its bounds, each over its derivative by z [-], of the value's
-        shape: after so many units of z a straight line in the value meets the bound."""
+        """How far the value can fall and rise until its bounds, each over its derivative by z [-], in its shape."""
         return jnp.full_like(z, jnp.inf), jnp.full_like(z, jnp.inf)
 
     def prior_residuals(self, value: Value) -> Array:
@@ -211,6 +207,15 @@ def leaves_of(where: Callable[[Experiment], Any] | None, experiment: Experiment)
     assert where is not None
     leaves = where(experiment)
     return leaves if isinstance(leaves, tuple) else (leaves,)
+
+
+def changes(parameter: AbstractParameter, experiment: Experiment, start: Any) -> list[str]:
+    """The dotted paths of the numbers of an experiment that a parameter changes, by a value that is not its start."""
+    other = parameter.put(experiment, jnp.asarray(1 + start + np.abs(start), start.dtype))
+    numbers = (eqx.filter(tree, eqx.is_array_like) for tree in (experiment, other))
+    before, after = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in numbers)
+    unlike = (path for path, a in after.items() if path not in before or not np.array_equal(a, before[path]))
+    return [jax.tree_util.keystr(path).lstrip(".") for path in unlike]
 
 
 class _PlainParameter(AbstractParameter):

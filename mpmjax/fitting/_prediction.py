@@ -39,17 +39,16 @@ def predict(
         mpm.fitting.predict(result, height)
 
     The error is by the delta method: √(g·C g) of each number, g its derivative by the search's coordinates (forward
-    mode) and C their covariance; the band is normal, or Student's where the noise was estimated. It holds as far as the
-    quantity is linear in the coordinates over their errors, which a parameter's profile shows.
+    mode) and C their covariance; the band is normal, or Student's where the noise was estimated, and holds as far as
+    the quantity is linear in the coordinates over their errors.
 
     Args:
         result: the fit.
         of: function of an experiment with the fitted parameters, that returns a number or an array; its runs take
             `adjoint=diffrax.ForwardMode()`.
-        experiment: the number of one that was fitted, or another one, into which the parameters are put, without those
-            that belong to some experiments only.
-        sigma: standard deviation of the noise of a new measurement, in the unit of the quantity; a number or an array
-            that broadcasts against it. Default: no prediction band.
+        experiment: the number of one that was fitted, or another one, with the parameters that belong to all.
+        sigma: noise of a new measurement, in the unit of the quantity; a number or an array that broadcasts against it.
+            Default: no prediction band.
         level: of the bands [-]. Default: that of the fit.
 
     Raises:
@@ -83,13 +82,13 @@ def predict_observations(
     *,
     level: Level | None = None,
 ) -> tuple[Prediction, ...]:
-    """The observations of a fit as it predicts them, with bands, in their order. The noise of a new measurement is that
-    which was given or estimated.
+    """The observations of a fit as it predicts them, with bands, in their order, and of new measurements with the noise
+    that was given or estimated.
 
     Args:
         result: the fit.
-        experiments: in the place of the fitted ones, as many with as many observations each, such as the same with more
-            data, or longer: their observations and end times are taken.
+        experiments: as many with as many observations each, such as the same with more data, or longer, of which
+            observations and end times are taken. Default: those fitted.
         level: of the bands [-]. Default: that of the fit.
 
     Raises:
@@ -113,7 +112,7 @@ def predict_observations(
         asked = tuple(replace(e, observations=a.observations, t1=a.t1) for e, a in zip(fitted, asked, strict=True))
         values, derivatives = _linearised(result, eqx.Partial(_observed, asked))
     predictions = []
-    each = zip(values, derivatives, observations, result.sigmas, strict=True)
+    each = zip(values, derivatives, observations, result.problem.sigmas, strict=True)
     for number, (value, J, o, sigma) in enumerate(each):
         # The noise of new measurements is the observation's own, or that of the fitted one.
         sigma = np.asarray(sigma if o.sigma is None else o.sigma, float)
@@ -179,11 +178,9 @@ def bootstrap(
     progress: Callable[[str], None] | None = None,
 ) -> Bootstrap:
     """Errors and intervals of a fit without linearisation: the fitted simulation's data with new normal noise of the
-    fit's σ, fitted again, many times (the parametric bootstrap: B. Efron, R. J. Tibshirani, An Introduction to the
-    Bootstrap, Chapman & Hall 1993, chapters 6.5 and 13).
-
-    It takes the model and independent noise for granted, and adds the model's curvature and what bounds do. `weight`
-    and `robust` act in each fit; a prior's mean is drawn anew too. 200 repeats fix a standard error to 5 %.
+    fit's σ, and priors' means, drawn and fitted again, many times (the parametric bootstrap: B. Efron,
+    R. J. Tibshirani, An Introduction to the Bootstrap, Chapman & Hall 1993, chapters 6.5 and 13). It takes the model
+    and independent noise for granted. 200 repeats fix a standard error to 5 %.
 
     Args:
         result: the fit.
@@ -201,13 +198,13 @@ def bootstrap(
     predicted = [np.asarray(y, float) for e in problem.at(z) for y in e.predictions(e.run())]
     problems = []
     for _ in range(repeats):
-        each = zip(problem.observations, predicted, result.sigmas, strict=True)
+        each = zip(problem.observations, predicted, problem.sigmas, strict=True)
         noisy = ((o, y + np.asarray(sigma) * rng.normal(size=y.shape)) for o, y, sigma in each)
         data = [np.where(np.isfinite(o.data), y, np.nan) for o, y in noisy]
         priors = [p.prior.drawn(rng) for p in problem.parameters if p.prior is not None]
         drawn = eqx.tree_at(lambda p: [o.data for o in p.observations], problem, data)
         drawn = eqx.tree_at(lambda q: [p.prior for p in q.parameters if p.prior is not None], drawn, priors)
-        problems.append((drawn, result.sigmas))
+        problems.append(drawn)
     members = search_many(
         problems,
         result.optimiser if optimiser is None else optimiser,

@@ -15,7 +15,7 @@ import numpy as np
 from mpmjax._types import Array, Float
 from mpmjax.checks import require, require_whole, shortened
 from mpmjax.fitting._experiment import AbstractObservation, Experiment, observe_all
-from mpmjax.fitting._parameter import AbstractParameter
+from mpmjax.fitting._parameter import AbstractParameter, changes
 from mpmjax.state import velocity_gradient
 
 Coordinates = Float[Array, "n"]  # the coordinates z of all parameters, one after the other [-]
@@ -23,12 +23,13 @@ Sigmas = tuple[Array, ...]  # the noise of each observation, in its data's unit
 
 
 class FitProblem(eqx.Module):
-    """The residuals of some experiments as a function of the coordinates of some parameters."""
+    """The residuals of some experiments, in units of a noise, as a function of the coordinates of some parameters."""
 
     experiments: tuple[Experiment, ...]  # the experiments, with the first guesses
     names: tuple[str, ...] = eqx.field(static=True)  # the names of the parameters
     parameters: tuple[AbstractParameter, ...]  # what is searched
     starts: tuple[Array, ...]  # the first guess of each
+    sigmas: Sigmas = ()  # the noise of each observation: given, estimated, or the size of its data until then
     memory: int = eqx.field(static=True, default=2**28)  # memory for what reverse mode stores, and for tangents [B]
     plane: tuple[Float[Array, "n"], Float[Array, "n f"]] | None = None  # see `on_plane`
 
@@ -45,6 +46,7 @@ class FitProblem(eqx.Module):
         dtypes = sorted({str(e.dtype) for e in experiments})
         require(len(dtypes) == 1, f"All experiments of a fit must have particles of one precision, got {dtypes}.")
         self.experiments, self.names, self.parameters = experiments, tuple(parameters), tuple(parameters.values())
+        self.sigmas = first_noise(experiments)
         self.starts = tuple(self._start(name, p) for name, p in parameters.items())
         self.parameters = tuple(replace(p, start=start) for p, start in zip(self.parameters, self.starts, strict=True))
         points, freedom = self.points, self.points + self.fixed_by_priors - self.size
@@ -53,7 +55,7 @@ class FitProblem(eqx.Module):
             f"{points} measured numbers cannot fix {self.size} parameters: measure more, give priors, or fit fewer.",
         )
         require(
-            any(self.noise_is_given) or freedom > 0,
+            any(o.sigma is not None for o in self.observations) or freedom > 0,
             f"{points} measured numbers fix {self.size} parameters and leave none to estimate the noise: give sigma.",
         )
 
@@ -66,15 +68,14 @@ class FitProblem(eqx.Module):
         experiment = self.experiments[numbers[0]]
         try:
             start = np.asarray(parameter.first_guess(experiment))
-            changed = parameter.put(experiment, jnp.asarray(1 + start + np.abs(start), start.dtype))
+            changed = changes(parameter, experiment, start)
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise ValueError(
                 f"The parameter {name!r} must name a number of the experiment e, such as "
                 f"lambda e: e.scene.material.youngs_modulus: {shortened(str(error), 200)}."
             ) from None
-        before, after = (list(filter(eqx.is_array_like, jax.tree.leaves(tree))) for tree in (experiment, changed))
-        same = len(before) == len(after) and all(map(np.array_equal, before, after))
-        require(not same, f"The parameter {name!r} changes nothing of the experiment: name a number that it has.")
+        fault = f"The parameter {name!r} changes nothing of the experiment: name a number that it has."
+        require(len(changed) > 0, fault)
         parameter.check(name, start)
         if parameter.prior is not None:
             parameter.prior.check(name, start.shape)
@@ -82,9 +83,12 @@ class FitProblem(eqx.Module):
             parameter.check_experiment(name, self.experiments[k])
         return jnp.asarray(start)
 
+    def with_noise(self, sigmas: Sigmas) -> "FitProblem":
+        """The problem with another noise of each observation."""
+        return eqx.tree_at(lambda p: p.sigmas, self, sigmas)
+
     def on_plane(self, origin: np.ndarray, basis: np.ndarray) -> "FitProblem":
-        """The problem on a plane of its coordinates, origin + basis y, shapes (n,) and (n, f), as a function of y: one
-        program for all planes of as many dimensions, spanned by some of the coordinates."""
+        """The problem as a function of y on a plane of some coordinates, origin + basis y, shapes (n,) and (n, f)."""
         plane = jnp.asarray(origin, self.dtype), jnp.asarray(basis, self.dtype)
         return eqx.tree_at(lambda p: p.plane, self, plane, is_leaf=lambda leaf: leaf is None)
 
@@ -126,16 +130,6 @@ class FitProblem(eqx.Module):
         return sum(p.prior.fixes(start.shape) for start, p in each if p.prior is not None)
 
     @property
-    def noise_is_given(self) -> tuple[bool, ...]:
-        """Whether the noise of each observation is given, and not to be estimated."""
-        return tuple(o.sigma is not None for o in self.observations)
-
-    @property
-    def first_sigmas(self) -> tuple[Array, ...]:
-        """The noise of each observation, or what stands for it until it is estimated."""
-        return tuple(jnp.asarray(o.scale() if o.sigma is None else o.sigma, self.dtype) for o in self.observations)
-
-    @property
     def labels(self) -> tuple[str, ...]:
         """A name for each coordinate: that of its parameter, with an index where that has several."""
         return tuple(
@@ -155,9 +149,9 @@ class FitProblem(eqx.Module):
         return tuple(parameter.logarithmic for parameter in self.owners)
 
     @eqx.filter_jit
-    def rounding_of_data(self, sigmas: Sigmas) -> Array:
+    def rounding_of_data(self) -> Array:
         """ε √Σ (data/σ)², the rounding of what the residuals are the difference of [-]."""
-        each = zip(self.observations, sigmas, strict=True)
+        each = zip(self.observations, self.sigmas, strict=True)
         ratios = (jnp.asarray(o.data, self.dtype) / jnp.asarray(sigma, self.dtype) for o, sigma in each)
         squares = sum((jnp.nansum(ratio**2) for ratio in ratios), jnp.zeros((), self.dtype))
         return float(jnp.finfo(self.dtype).eps) * jnp.sqrt(squares)
@@ -210,11 +204,10 @@ class FitProblem(eqx.Module):
         change = velocity_gradient(experiment.scene, eqx.tree_at(lambda q: q.v, now, now.v - before.v))
         return eqx.tree_at(lambda e: e.particles.C, experiment, now.C + change)
 
-    def residuals(self, z: Coordinates, sigmas: Sigmas, adjoint: Any) -> tuple[Array, Array]:
-        """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does
-        not reach a measurement; and the reports of tangent solves (`Run.report`). `adjoint` is how diffrax
-        differentiates, None reverse mode within the memory."""
-        parts, reports, noise = [], [], iter(sigmas)
+    def residuals(self, z: Coordinates, adjoint: Any) -> tuple[Array, Array]:
+        """The residuals of all observations, then of priors [-], shape (m,), NaN where a run met a fault or does not
+        reach; and its reports of tangent solves. `adjoint` is diffrax's, None for reverse mode within the memory."""
+        parts, reports, noise = [], [], iter(self.sigmas)
         for experiment in self.at(z):
             run = experiment.run(adjoint=adjoint, throw=False, checkpoint_bytes=self.memory)
             each = zip(experiment.observations, run.observed, strict=True)
@@ -228,12 +221,12 @@ class FitProblem(eqx.Module):
         each = zip(self.parameters, self.values(z), strict=True)
         return jnp.concatenate([parameter.prior_residuals(value) for parameter, value in each])
 
-    def gradient(self, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array, Coordinates]:
-        """The residuals r, ½ Σ r² and its derivative by the coordinates, by one pass of reverse mode, whatever their
-        number. NaN where a simulation met a fault, the derivative also where an adjoint solve did not converge."""
+    def gradient(self, z: Coordinates) -> tuple[Array, Array, Coordinates]:
+        """The residuals r, ½ Σ r² and its derivative by the coordinates, by one pass of reverse mode. NaN where a
+        simulation met a fault, the derivative also where an adjoint solve did not converge."""
 
         def cost(z: Coordinates) -> tuple[Array, Array]:
-            r = self.residuals(z.astype(self.dtype), sigmas, None)[0].astype(z.dtype)
+            r = self.residuals(z.astype(self.dtype), None)[0].astype(z.dtype)
             return (r**2).sum() / 2, r
 
         (value, r), slope = jax.value_and_grad(cost, has_aux=True)(z)
@@ -249,18 +242,16 @@ class FitProblem(eqx.Module):
                 observation.explain(seen, run)
         raise ValueError(failure)
 
-    def jacobian(
-        self, z: Coordinates, sigmas: Sigmas, mode: Literal["forward", "reverse"] | None = None
-    ) -> tuple[Array, Array]:
-        """The residuals and their derivative by the coordinates, shape (m, n). NaN where a tangent or adjoint solve did
-        not converge. The mode is "forward", a tangent of each coordinate beside the simulation, or "reverse", a pass
-        back for each measured number, as many at once as the memory holds; default: the cheaper one."""
+    def jacobian(self, z: Coordinates, mode: Literal["forward", "reverse"] | None = None) -> tuple[Array, Array]:
+        """The residuals and their derivative by the coordinates, shape (m, n), NaN where a tangent or adjoint solve did
+        not converge: "forward", by a tangent of each coordinate beside the simulation, or in "reverse", by a pass back
+        for each measured number, as many at once as the memory holds; default: the cheaper one."""
         if (self.cheaper_mode if mode is None else mode) == "reverse":
-            r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
+            r, pull, _ = jax.vjp(lambda z: self.residuals(z, None), z, has_aux=True)
             units = np.eye(self.measured, len(r), dtype=r.dtype)  # priors need no simulation
             _, (rows,) = in_batches(lambda unit: ((), pull(unit)), units, self.at_once)
             return r, jnp.concatenate([rows, jax.jacfwd(self.prior_residuals)(z)])
-        evaluate = partial(self.residuals, sigmas=sigmas, adjoint=diffrax.ForwardMode())
+        evaluate = partial(self.residuals, adjoint=diffrax.ForwardMode())
         (r, _), (columns, unsolved) = linearised(evaluate, z, self.at_once)
         return r, jnp.where((unsolved != 0).any(), jnp.nan, columns.T)
 
@@ -277,6 +268,12 @@ class FitProblem(eqx.Module):
             seen = jax.eval_shape(eqx.Partial(observe_all, e.observations), e.scene, e.particles)
             each += _COPIES * size_of(e.particles) + size_of(seen) * (e.steps + 1)
         return max(1, int(self.memory // max(each, 1)))
+
+
+def first_noise(experiments: Sequence[Experiment]) -> Sigmas:
+    """The noise of each observation, or what stands for it until it is estimated."""
+    noise = ((e.dtype, o.scale() if o.sigma is None else o.sigma) for e in experiments for o in e.observations)
+    return tuple(jnp.asarray(sigma, dtype) for dtype, sigma in noise)
 
 
 @eqx.filter_jit
@@ -308,8 +305,7 @@ def linearised(function: Callable[[Coordinates], Any], z: Coordinates, at_once: 
 
 
 def in_batches(function: Callable[[Any], tuple[Any, Any]], units: Any, at_once: int) -> tuple[Any, Any]:
-    """A function of each row of `units`, arrays (k, ...), by batches of `at_once` rows. It returns two pytrees: one
-    that all rows share, and one of each row, which gets a leading axis k."""
+    """A function of each row of `units`, arrays (k, ...), `at_once` together: what all share, and of each, (k, ...)."""
     count = len(jax.tree.leaves(units)[0])
     batches = -(-count // at_once)
     size = -(-count // batches)
@@ -332,6 +328,5 @@ def in_batches(function: Callable[[Any], tuple[Any, Any]], units: Any, at_once: 
 
 
 SHOWN = 4  # parameters that a line has room for
-ROW_COST = 1.2
-"""Cost of a row of the Jacobian by reverse mode, over that of a column by forward mode (benchmarks/fit_cost.py)."""
+ROW_COST = 1.2  # of the Jacobian by reverse mode, over that of a column by forward mode (benchmarks/fit_cost.py)
 _COPIES = 16  # memory that a tangent takes, in sizes of the particles' (benchmarks/fit_cost.py)

@@ -1,7 +1,7 @@
 """Profile likelihoods: intervals that need no straight line."""
 
-from collections.abc import Callable, Iterator
-from typing import Annotated, NamedTuple
+from collections.abc import Callable
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -79,11 +79,9 @@ def profile(
     where Δχ² is below a threshold: the quantile of χ² of one degree of freedom where the noise was given, of F(1, ν)
     where it was estimated with ν degrees of freedom (D. M. Bates, D. G. Watts, Nonlinear Regression Analysis and Its
     Applications, Wiley 1988, chapter 6; D. J. Venzon, S. H. Moolgavkar, Applied Statistics 37 (1988) 87,
-    doi 10.2307/2347496). It does not depend on the coordinate, and in a linear problem is that of the standard error.
-
-    Where the threshold is never reached the interval is open, and where Δχ² jumps over it, as beyond a stable step, it
-    ends there: a warning says so. Where the misfit is beyond the noise, the threshold is larger by the square of what
-    errors are. With a robust or weighted observation it is approximate. One program is compiled for all numbers.
+    doi 10.2307/2347496), larger by the square of what errors are where the misfit is beyond the noise. It does not
+    depend on the coordinate. Where the threshold is never reached it is open, and where Δχ² jumps over it, as beyond a
+    stable step, it ends there, with a warning. With a robust or weighted observation it is approximate.
 
     Args:
         result: the fit.
@@ -100,7 +98,8 @@ def profile(
     problem, names = result.problem, result.problem.labels
     require(label in names, f"A profile is of a fitted number: {', '.join(names)}. Got {label!r}.")
     level = float(result.level if level is None else level)
-    path = _Path(result, names.index(label), result.optimiser if optimiser is None else optimiser, progress)
+    say = progress or (lambda text: None)
+    path = _Path(result, names.index(label), result.optimiser if optimiser is None else optimiser, say)
     at, errors = path.at, result.uncertainty
     # By the noise alone √Δχ² is one at a standard error; the threshold is as much farther as the misfit widens that.
     wider = result.estimates[at].error / result.estimates[at].noise_error
@@ -109,11 +108,19 @@ def profile(
     reach = float(quantile(level, freedom)) * wider
     ends = [_walk(path, side, reach, points, float(errors.error[at]) / wider, float(rtol)) for side in (-1, 1)]
 
-    texts = [f"{label}: {text}" for text in _remarks(path, ends, reach)]
+    z, growth = min(path.visited, key=lambda point: point[1])
+    if growth < -_BETTER:
+        path.remarks.append(
+            f"the profile found a misfit smaller by {-growth:.2g} at {path.numbers(z)[at]:.5g}: the fit is not at the "
+            "least one. Fit again from there."
+        )
+    if path.unsettled:
+        path.remarks.append(f"at {path.unsettled} points of the profile the others did not converge.")
+    texts = [f"{label}: {text}" for text in path.remarks]
     for text in texts:
         warn(text)
     visited = sorted(path.visited, key=lambda point: point[0][at])
-    numbers, values = np.stack([path.numbers(z) for z, _ in visited]), [path.value(end.place) for end in ends]
+    numbers, values = np.stack([path.numbers(z) for z, _ in visited]), [path.value(end) for end in ends]
     pull = result.jacobian.T @ result.residuals * np.array([e.at_bound for e in result.estimates])
     symmetric = intervals(problem, jnp.asarray(result.z), errors, pull / wider**2, level)
     return Profile(
@@ -137,15 +144,14 @@ _Point = tuple[np.ndarray, float]  # all coordinates where one is held, the othe
 
 
 class _Path:
-    """The least misfit along one coordinate: what was visited of it so far."""
+    """The least misfit along one coordinate: what was visited of it so far, and what is to be said of it."""
 
-    def __init__(
-        self, result: FitResult, at: int, optimiser: AbstractOptimiser, progress: Callable[[str], None] | None
-    ):
-        self.problem, self.sigmas, self.optimiser = result.problem, result.sigmas, optimiser
-        self.at, self.progress, self.uncertainty = at, progress, result.uncertainty
+    def __init__(self, result: FitResult, at: int, optimiser: AbstractOptimiser, progress: Callable[[str], None]):
+        self.problem, self.optimiser, self.at = result.problem, optimiser, at
+        self.progress, self.uncertainty = progress, result.uncertainty
         self.start: _Point = np.asarray(result.z, float), 0.0
         self.least, self.visited, self.unsettled = self._misfit(self.start[0]), [self.start], 0
+        self.remarks = list[str]()
         errors, unit = result.uncertainty, np.eye(self.problem.size)[at]
         blind = errors.unseen.shape[1] and np.isinf(errors.error[at])
         # how the other coordinates follow this one when it is moved, by the covariance
@@ -169,7 +175,7 @@ class _Path:
         return float(np.log1p(pace)) if np.isfinite(room).any() else pace
 
     def _misfit(self, z: np.ndarray) -> float:
-        return 2 * float(costs_at(self.problem, z[None], self.sigmas, 1)[0])
+        return 2 * float(costs_at(self.problem, z[None], 1)[0])
 
     def visit(self, place: float, last: _Point, before: _Point) -> _Point | None:
         """The least misfit with the coordinate held at a place, from the line through two points, or along the
@@ -183,7 +189,7 @@ class _Path:
         else:
             basis = np.delete(np.eye(len(z)), at, axis=1)
             held = problem.on_plane(z, basis)
-            end = search(held, self.optimiser, jnp.zeros(held.size, problem.dtype), self.sigmas)
+            end = search(held, self.optimiser, jnp.zeros(held.size, problem.dtype))
             if end.interrupted:
                 raise KeyboardInterrupt
             if end.failure:
@@ -193,23 +199,21 @@ class _Path:
         if not np.isfinite(square):
             return None
         self.visited.append((z, square - self.least))
-        if self.progress is not None:
-            label = problem.labels[at]
-            self.progress(f"profile of {label}: Δχ² {square - self.least:8.4g}  {problem.shown(z)}")
+        self.progress(f"profile of {problem.labels[at]}: Δχ² {square - self.least:8.4g}  {problem.shown(z)}")
         return self.visited[-1]
 
+    def open_end(self, side: int, last: _Point, reach: float, fault: float) -> float:
+        """The infinite end of an interval, below the threshold at its last point, and before a `fault`, if finite."""
+        beyond = f" Beyond, at {self.value(fault):.5g}, the simulation fails." if np.isfinite(fault) else ""
+        self.remarks.append(
+            f"the interval is open {_SIDES[side]}. At {self.numbers(last[0])[self.at]:.5g} Δχ² is "
+            f"{max(last[1], 0):.2g}, less than {reach**2:.3g}: the data do not bound it.{beyond}"
+        )
+        return side * np.inf
 
-class _End(NamedTuple):
-    """Where a walk along a path ended."""
 
-    place: float  # the coordinate where √Δχ² crosses the threshold's; infinite if it does not
-    last: _Point  # the last point before
-    fault: float | None = None  # the nearest coordinate at which the simulation fails, if it does
-    jump: float | None = None  # Δχ² beyond a jump, if there is one
-
-
-def _walk(path: _Path, side: int, reach: float, points: int, error: float, rtol: float) -> _End:
-    """Walk to one side, in so many points or more, until √Δχ² is beyond `reach`."""
+def _walk(path: _Path, side: int, reach: float, points: int, error: float, rtol: float) -> float:
+    """The coordinate to one side where √Δχ² is `reach`, walked to in so many points or more; infinite if never."""
     start, at = path.start, path.at
     farthest = max(_FARTHEST, 3 * reach * error) if np.isfinite(error) else _FARTHEST
     before, last, pace, fault = start, start, path.pace(error), np.inf
@@ -224,7 +228,7 @@ def _walk(path: _Path, side: int, reach: float, points: int, error: float, rtol:
                 break
             continue
         if _root(point) >= reach:
-            return _crossing(path, last, point, reach, rtol)
+            return _crossing(path, side, last, point, reach, rtol)
         grown = _root(point) - _root(last)
         longest = _FASTER * (wanted - gone) * points / reach
         pace = min((wanted - gone) / grown, longest) if grown > 0 else longest
@@ -232,10 +236,10 @@ def _walk(path: _Path, side: int, reach: float, points: int, error: float, rtol:
         before, last = last, point
         if wanted >= farthest or abs(here - there) <= _STILL * (wanted - gone) * abs(estimate):
             break
-    return _End(side * np.inf, last, float(start[0][at] + side * fault) if np.isfinite(fault) else None)
+    return path.open_end(side, last, reach, float(start[0][at] + side * fault))
 
 
-def _crossing(path: _Path, below: _Point, above: _Point, reach: float, rtol: float) -> _End:
+def _crossing(path: _Path, side: int, below: _Point, above: _Point, reach: float, rtol: float) -> float:
     """Where √Δχ² is `reach` between two points, by Brent's method. What fails to be simulated counts as beyond."""
     from scipy.optimize import root_scalar  # here, since it takes long to import
 
@@ -251,39 +255,19 @@ def _crossing(path: _Path, below: _Point, above: _Point, reach: float, rtol: flo
     within = rtol / 2 * abs(above[0][at] - path.start[0][at])
     root = float(root_scalar(excess, method="brentq", bracket=(below[0][at], above[0][at]), xtol=within).root)
     sides = ([p for p in tried if (excess(p) < 0) == inside] for inside in (True, False))
-    inner, outer = (min(side, key=lambda p: abs(p - root)) for side in sides)
+    inner, outer = (min(places, key=lambda p: abs(p - root)) for places in sides)
     last, beyond = tried[inner], tried[outer]
     assert last is not None
     if excess(outer) - excess(inner) < _JUMP * reach or abs(outer - inner) > 4 * within:
-        return _End(root, last)
+        return root
     if beyond is None:
-        return _End(float(np.copysign(np.inf, outer - inner)), last, fault=float(outer))
-    return _End(root, last, jump=beyond[1])
-
-
-def _remarks(path: _Path, ends: list[_End], reach: float) -> Iterator[str]:
-    """Warnings of an interval: ends that are none, a better minimum, searches that did not end."""
-    for (place, (z, growth), fault, jump), where in zip(ends, ("below", "above"), strict=True):
-        number = path.numbers(z)[path.at]
-        if jump is not None:
-            yield (
-                f"the interval ends {where} at {number:.5g}, where Δχ² jumps from {max(growth, 0):.2g} to {jump:.2g}: "
-                "the simulation changes abruptly there, and not the data end it. See whether its step is stable."
-            )
-        if np.isinf(place):
-            beyond = "" if fault is None else f" Beyond, at {path.value(fault):.5g}, the simulation fails."
-            yield (
-                f"the interval is open {where}. At {number:.5g} Δχ² is {max(growth, 0):.2g}, less than "
-                f"{reach**2:.3g}: the data do not bound it.{beyond}"
-            )
-    z, growth = min(path.visited, key=lambda point: point[1])
-    if growth < -_BETTER:
-        yield (
-            f"the profile found a misfit smaller by {-growth:.2g} at {path.numbers(z)[path.at]:.5g}: the fit is not at "
-            "the least one. Fit again from there."
-        )
-    if path.unsettled:
-        yield f"at {path.unsettled} points of the profile the others did not converge."
+        return path.open_end(side, last, reach, float(outer))
+    path.remarks.append(
+        f"the interval ends {_SIDES[side]} at {path.numbers(last[0])[at]:.5g}, where Δχ² jumps from "
+        f"{max(last[1], 0):.2g} to {beyond[1]:.2g}: the simulation changes abruptly there, and not the data end it. "
+        "See whether its step is stable."
+    )
+    return root
 
 
 def _root(point: _Point) -> float:
@@ -291,6 +275,7 @@ def _root(point: _Point) -> float:
     return float(np.sign(point[1]) * np.sqrt(abs(point[1])))
 
 
+_SIDES = {-1: "below", 1: "above"}
 _FARTHEST = 14.0  # coordinates that a profile is followed: to a millionth and a million-fold of a positive number
 _MOST_POINTS = 40  # on one side
 _BEYOND = 1.02  # steps are so much longer than foretold: in a linear problem the last one goes beyond the threshold

@@ -41,10 +41,7 @@ class Markers(eqx.Module):
     @checked
     def at(cls, particles: Particles, places: Rows) -> "Markers":
         """Markers painted on places of a body as it starts [m], shape (m, d); a ValueError if one does not lie on it.
-
-        A marker moves as the mean of its nearest particles, by shares of least squares that reproduce its place: exact
-        of any motion that is affine beside it.
-        """
+        Each moves as the mean of its nearest particles, by shares of least squares: exact of affine motion."""
         x, places = np.asarray(particles.x, float), np.asarray(places, float)
         d = particles.dim
         require(
@@ -94,8 +91,7 @@ class Extent(eqx.Module):
     """How far particles with mass reach: a front or height [m], whose derivative is that of the farthest one."""
 
     axis: int = eqx.field(static=True)  # the direction
-    side: Literal["upper", "lower"] = eqx.field(static=True, default="upper")
-    """"upper" for the largest coordinate, "lower" for the smallest."""
+    side: Literal["upper", "lower"] = eqx.field(static=True, default="upper")  # the largest coordinate, or the smallest
     __check_init__ = require_fields
 
     def __call__(self, scene: Scene, particles: Particles) -> Float[Array, ""]:

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from mpmjax.fitting._estimate import (
 )
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
 from mpmjax.fitting._starts import Screening
 from mpmjax.fitting._uncertainty import (
@@ -45,9 +45,8 @@ from mpmjax.state import warn_of_rounding
 class FitResult(AbstractFit):
     """Fitted parameters, their errors, and the fitted scene."""
 
-    problem: FitProblem  # the residuals that were made small
+    problem: FitProblem  # the residuals that were made small, with the noise given or estimated
     z: np.ndarray  # the coordinates at the minimum [-], shape (n,)
-    sigmas: Sigmas  # the noise of each observation, given or estimated, in the data's unit
     residuals: np.ndarray  # residuals of all observations, then of priors, in units of their noise [-], shape (m,)
     jacobian: np.ndarray  # their derivative by the coordinates, shape (m, n)
     uncertainty: Uncertainty  # covariance, correlation, Fisher spectrum and its directions
@@ -62,11 +61,9 @@ class FitResult(AbstractFit):
     optimiser: AbstractOptimiser  # the method of the search
     converged: bool  # whether the search met its tolerance
     history: tuple[Iteration, ...]  # the iterations of the search
-    warnings: tuple[str, ...]
-    """Directions that the data do not see, and a misfit that the noise does not explain, in words."""
+    warnings: tuple[str, ...]  # directions that the data do not see, and a misfit beyond the noise, in words
     interrupted: bool = False  # whether Ctrl-C ended it
-    moved: np.ndarray | str | None = None
-    """How far z moves on twice the spacing, then with twice the step, shape (2, n); or why that is not known."""
+    moved: np.ndarray | str | None = None  # how far z moves on twice the spacing, then step, shape (2, n); or why not
     screening: Screening | None = None  # the other points from which the minimum was searched, if it was
     remarks: tuple[str, ...] = ()  # how its start was come by, in words
 
@@ -87,10 +84,10 @@ class FitResult(AbstractFit):
     @property
     def fitted(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """The fit's value of each observation where it was measured, NaN elsewhere, in the shape and unit of its
-        data, and its derivative by the coordinates, shape (..., n): both follow from the residuals."""
+        data, and its derivative by the coordinates, shape (..., n), from the residuals."""
         values, derivatives = [], []
         observations = [o for e in self.experiments for o in e.observations]
-        for o, sigma, rows in zip(observations, self.sigmas, self.problem.rows, strict=True):
+        for o, sigma, rows in zip(observations, self.problem.sigmas, self.problem.rows, strict=True):
             weight, limit = o.trust
             r, J = self.residuals[rows] / np.sqrt(weight), self.jacobian[rows] / np.sqrt(weight)
             if limit is not None:  # the inverse of `drawn_nearer`
@@ -154,8 +151,7 @@ class FitResult(AbstractFit):
 
     @property
     def p_value(self) -> float:
-        """The probability of so large a χ² if the model and the noise given are right; NaN if noise was estimated, or
-        an observation is robust or weighted."""
+        """The probability of so large a χ² by the noise given alone; NaN if any is estimated, robust or weighted."""
         plain = all(o.trust == (1.0, None) for e in self.experiments for o in e.observations)
         if not plain or any(noise.estimated for noise in self.noise) or self.degrees_of_freedom < 1:
             return np.nan
@@ -196,18 +192,29 @@ class FitResult(AbstractFit):
 
 
 Noise = list[tuple[Array, float, float]]
-"""The noise of each observation, in its data's unit, by the residuals at a minimum; the factor by which it is larger
-than it was in the search; and the degrees of freedom of the estimate, zero where the noise is given."""
+"""The noise of each observation, in its data's unit, by how much it is larger than in the search, and the degrees of
+freedom of the estimate, zero where it is given."""
 Both = tuple[Uncertainty, Uncertainty]  # by the noise and what the misfit shows, and by the noise alone
 
 
-def settle_noise(problem: FitProblem, minimum: Search, sigmas: Sigmas) -> tuple[Noise, bool]:
-    """The noise by the residuals at a minimum that was searched with `sigmas`, and whether the change moves it."""
-    r, J = np.asarray(minimum.seen.residuals), np.asarray(minimum.seen.jacobian)
-    J = J[:, ~at_bound(r, J, np.asarray(problem.room(minimum.z)))]  # what a bound holds fits nothing away
+class Minimum(NamedTuple):
+    """Where a search ended, and the noise by its residuals."""
+
+    problem: FitProblem  # with the noise that it was searched with
+    search: Search
+    noise: Noise | None  # None where the search failed
+    moves: bool  # whether that noise moves the minimum
+
+
+def minimum_of(problem: FitProblem, search: Search) -> Minimum:
+    """The noise by the residuals where a search of a problem ended."""
+    if search.failure:
+        return Minimum(problem, search, None, moves=False)
+    r, J = np.asarray(search.seen.residuals), np.asarray(search.seen.jacobian)
+    J = J[:, ~at_bound(r, J, np.asarray(problem.room(search.z)))]  # what a bound holds fits nothing away
     settled, changing = [], False
-    each = zip(problem.observations, problem.rows, problem.noise_is_given, sigmas, strict=True)
-    for observation, rows, is_given, sigma in each:
+    for observation, rows, sigma in zip(problem.observations, problem.rows, problem.sigmas, strict=True):
+        is_given = observation.sigma is not None
         factor, freedom = (1.0, 0.0) if is_given else noise(r, J, rows, observation.count, *observation.trust)
         require(
             np.isfinite(factor),
@@ -220,37 +227,38 @@ def settle_noise(problem: FitProblem, minimum: Search, sigmas: Sigmas) -> tuple[
         changing |= abs(factor - 1) > _NOISE_RTOL and factor > floor
     # Another noise of one observation, of squares alone and without priors, does not move the minimum.
     one = len(settled) == 1 and problem.observations[0].robust is None
-    return settled, changing and not (one and all(p.prior is None for p in problem.parameters))
+    moves = changing and not (one and all(p.prior is None for p in problem.parameters))
+    return Minimum(problem, search, settled, moves)
 
 
 def fit_result(
-    problem: FitProblem,
+    minimum: Minimum,
     optimiser: AbstractOptimiser,
-    minimum: Search,
-    settled: Noise,
     report: Mapping[str, Callable[[Experiment], Any]],
     level: float,
     coarse: CoarseGrid | str | None = None,
-) -> FitResult:
-    """The result at a minimum, with residuals in units of its search's noise; options as of `fit` and its result."""
-    r, J = np.array(minimum.seen.residuals, float), np.array(minimum.seen.jacobian, float)
+) -> FitResult | None:
+    """The result at a minimum, None where the search failed; options as of `fit` and its result."""
+    problem, end, settled, _ = minimum
+    if settled is None:
+        return None
+    r, J = np.array(end.seen.residuals, float), np.array(end.seen.jacobian, float)
     for rows, (_, factor, _) in zip(problem.rows, settled, strict=True):
         r[rows], J[rows] = r[rows] / factor, J[rows] / factor
-    z, eps, rest = minimum.z, float(jnp.finfo(problem.dtype).eps), unexplained(r, J, coarse)
+    z, eps, rest = end.z, float(jnp.finfo(problem.dtype).eps), unexplained(r, J, coarse)
     moved = coarse.moved if isinstance(coarse, CoarseGrid) else coarse
     judged = (_judged(problem, k, settled, r, J, rest) for k in range(len(settled)))
     noises, of_noise, of_misfit = zip(*judged, strict=True)
 
     held, gradient = at_bound(r, J, np.asarray(problem.room(z))), J.T @ r
     off = [moved] if isinstance(moved, np.ndarray) else []
-    if not minimum.converged:
+    if not end.converged:
         off.append(uncertainty(J * ~held, eps, ()).inverse @ gradient)
     errors = uncertainty(J, eps, of_misfit, np.vstack(off) if off else None)
     both = errors, uncertainty(J, eps, of_noise)
     result = FitResult(
-        problem=problem,
+        problem=problem.with_noise(tuple(sigma for sigma, *_ in settled)),
         z=np.asarray(z),
-        sigmas=tuple(sigma for sigma, *_ in settled),
         residuals=r,
         jacobian=J,
         uncertainty=errors,
@@ -263,20 +271,20 @@ def fit_result(
         degrees_of_freedom=problem.points + len(r) - problem.measured - errors.rank + int(held.sum()),
         noise=noises,
         experiments=problem.at(z),
-        runs=minimum.seen.runs,
+        runs=end.seen.runs,
         level=level,
         optimiser=optimiser,
-        converged=minimum.converged,
-        history=minimum.history,
+        converged=end.converged,
+        history=end.history,
         warnings=(),
-        interrupted=minimum.interrupted,
+        interrupted=end.interrupted,
         moved=moved,
     )
 
     texts = seen_together(problem.labels, errors, problem.logarithmic)
     if isinstance(moved, str):
         texts.append(f"On twice the spacing nothing is known, so that errors hold nothing of the grid: {moved}")
-    if not minimum.converged and optimiser.has_stalled(minimum.inner):
+    if not end.converged and optimiser.has_stalled(end.inner):
         texts.append(
             "The search ended at a kink of the misfit, as where friction begins to stick, or where simulations fail "
             "beyond: errors hold the step that it left undone."
@@ -298,9 +306,9 @@ def fit_result(
 def _judged(
     problem: FitProblem, k: int, settled: Noise, r: np.ndarray, J: np.ndarray, rest: np.ndarray
 ) -> tuple[NoiseEstimate, tuple[slice, float, float], tuple[slice, float, float]]:
-    """The noise of observation k by residuals r, of which twice the spacing leaves the `rest` unexplained, and what
-    `uncertainty` takes of it: by the noise alone, and by what the misfit shows."""
-    observation, rows, is_given = problem.observations[k], problem.rows[k], problem.noise_is_given[k]
+    """The noise of observation k by residuals r, of which twice the spacing leaves the `rest`, and what `uncertainty`
+    takes of it: by the noise alone, and by what the misfit shows."""
+    observation, rows, is_given = problem.observations[k], problem.rows[k], problem.observations[k].sigma is not None
     (sigma, _, freedom), weight, count = settled[k], observation.trust[0], observation.count
     size, squares = float(np.sqrt((np.asarray(sigma) ** 2).mean())), (r[rows] ** 2).sum()
     misfit = float(np.sqrt(squares / max(count, 1)))
@@ -362,10 +370,9 @@ def intervals(
     """Lower and upper ends of the fitted numbers' intervals, each of shape (n,).
 
     They are where Δχ² = 2 g δ + δ²/s² reaches its threshold q², δ of the coordinate, s the standard error and g the
-    gradient, zero but of what a bound holds. Beside a bound, at three times the reach or nearer, data that follow the
-    value would be missed too often: there each end is the farther of two, of the coordinate and of a straight line in
-    the value. Where that line meets the bound, it alone makes the interval, which ends there: the coordinate never
-    comes to a bound.
+    gradient, zero but of what a bound holds. Beside a bound, at three times the reach or nearer, each end is the
+    farther of two, of the coordinate and of a straight line in the value, or the truth would be missed too often. Where
+    that line meets the bound, it alone makes the interval, which ends there.
     """
     error, freedom = errors.of(np.eye(problem.size))
     q = quantile(level, freedom)
@@ -394,8 +401,7 @@ _SHAPES = {
 }
 _EXACT = 1e-6  # misfit, in sizes of the data, below which data are exact
 _ROUNDINGS = 100  # the same in roundings
-_LEAST_FREEDOM = 4.0
-"""Degrees of freedom of a misfit, at least: the factor errs to the safe side, and fewer would widen intervals more."""
+_LEAST_FREEDOM = 4.0  # of a misfit: the factor errs to the safe side, and fewer would widen intervals more
 _BESIDE = 3  # reaches of an interval within which it is beside a bound
 _NOISE_RTOL = 1e-3  # the noise of several observations is settled when its estimate changes less, relatively
 _LEAST = 1e-12  # smallest noise, in sizes of the data: exact data have none

@@ -12,31 +12,28 @@ import numpy as np
 
 from mpmjax._types import Array
 from mpmjax.checks import require, require_fields
-from mpmjax.fitting._evaluation import Evaluation, evaluated, parts_kept
-from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._evaluation import Evaluation, evaluated
+from mpmjax.fitting._problem import Coordinates, FitProblem
 
 
 class AbstractOptimiser(eqx.Module):
     """A method that searches the least Σ r², one iteration at a time.
 
     One of your own gives `begin`, `iterate` and `has_converged`. Its state is a pytree of arrays that says all it
-    remembers, so that a search can be written to a file and continued. Its methods are given the problem that is
-    minimised, the coordinates z where the search is, and the noise of each observation.
+    remembers, so that a search can be written to a file and continued; its `z` are the coordinates where the search is.
     """
 
     max_steps: eqx.AbstractVar[int]  # most iterations
     __check_init__ = require_fields
 
     @abc.abstractmethod
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Any:
+    def begin(self, problem: FitProblem, z: Coordinates) -> Any:
         """The state before the first iteration, which starts at z."""
 
     @abc.abstractmethod
-    def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: Any
-    ) -> tuple[Coordinates, Any, Evaluation]:
-        """One iteration from the state that `begin` or the last iteration returned: where it is now, the state, and
-        what it knows of that place. The first one evaluates where it starts. No step may end where simulations fail."""
+    def iterate(self, problem: FitProblem, state: Any) -> tuple[Any, Evaluation]:
+        """One iteration from the state that `begin` or the last iteration returned: the state, and what it knows of
+        where it is. The first one evaluates where it starts. No step may end where simulations fail."""
 
     @abc.abstractmethod
     def has_converged(self, state: Any, seen: Evaluation) -> bool:
@@ -46,16 +43,12 @@ class AbstractOptimiser(eqx.Module):
         """The one place at which the next iteration asks the problem for residuals and Jacobian, where that is all it
         asks for: programs of their own then compute them, in the place of `iterate`. Default: None."""
 
-    def directed(
-        self, before: "Search", z: Coordinates, state: Any, seen: Evaluation
-    ) -> tuple[Coordinates, Any, Evaluation]:
-        """An iteration's outcome as the search takes it from where it was `before`, outside of what is compiled.
-        Default: as it is."""
-        return z, state, seen
+    def directed(self, before: "Search", state: Any, seen: Evaluation) -> tuple[Any, Evaluation]:
+        """An iteration's outcome as the search takes it, outside of what is compiled. Default: as it is."""
+        return state, seen
 
     def distance(self, state: Any, seen: Evaluation) -> float:
-        """How far the search is from converged, as a multiple of where it ends, by which the time left is estimated;
-        NaN if that is not known, which is the default."""
+        """How far the search is from converged, over where it ends, for the time left. Default: NaN, not known."""
         return float("nan")
 
     def has_stalled(self, state: Any) -> bool:
@@ -91,13 +84,13 @@ class Search(NamedTuple):
         return self.history[-1].cost
 
 
-def search(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas) -> Search:
-    """The least Σ r² near z with this noise; see `search_many`."""
-    return search_many([(problem, sigmas)], optimiser, {0: z})[0]
+def search(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates) -> Search:
+    """The least Σ r² near z; see `search_many`."""
+    return search_many([problem], optimiser, {0: z})[0]
 
 
 def search_many(
-    problems: Sequence[tuple[FitProblem, Sigmas]],
+    problems: Sequence[FitProblem],
     optimiser: AbstractOptimiser,
     starts: Mapping[int, Any],
     *,
@@ -108,40 +101,40 @@ def search_many(
     done: Mapping[int, Search] | None = None,
     enough: Callable[[Search], bool] = lambda search: False,
     progress: Callable[[int, int], None] = lambda done, count: None,
-    report: Callable[[Sigmas, Search], None] = lambda sigmas, state: None,
+    report: Callable[[FitProblem, Search], None] = lambda problem, search: None,
 ) -> dict[int, Search]:
     """The least Σ r² of searches that differ in where they start or in their data, by their numbers.
 
-    One compiled program makes an iteration of `batch` searches together. A search that is done leaves its place to the
-    next one that waits. One that fails ends alone. An interruption (Ctrl-C) ends all where they are.
+    One compiled program makes an iteration of `batch` searches together; one that is done, or fails, leaves its place
+    to the next that waits. An interruption (Ctrl-C) ends all where they are.
 
     Args:
-        problems: a problem and the noise of its observations for each number, or one for all searches.
+        problems: that of each number, or one for all searches.
         starts: where each starts, by its number.
-        joining: a search that comes so near to another one of one problem with a lower cost, in each coordinate, is
-            ended: it would go the same way. Zero ends none.
+        joining: a search that comes so near to another one with a lower cost, in each coordinate, is ended: it would go
+            the same way. Zero ends none.
         settling: a search is at a minimum too where its last three moves lowered the cost by less than this part of it,
             since Gauss-Newton steps are slow where residuals are large, or where it goes no further. Zero ends none.
         state: in the place of its start, an earlier state of the first search, which is continued exactly.
         done: earlier searches, by their numbers, which are returned with the others.
-        enough: says of each search that has ended whether those that wait need not begin; they are left out.
+        enough: says of each search that has ended whether those that wait are left out.
         progress: called with how many are done, and of how many.
-        report: called with the noise and the search after each iteration that did not fail.
+        report: called with the problem and the search after each iteration that did not fail.
     """
     waiting, done, stacked = deque(starts), dict(done or {}), _stacked(problems)
     before, unseen = len(done), Evaluation(jnp.zeros(()), jnp.zeros(0))
     running: dict[int, Search] = {} if state is None else {waiting.popleft(): state}
 
-    def problem_of(k: int) -> tuple[FitProblem, Sigmas]:
+    def problem_of(k: int) -> FitProblem:
         return problems[0 if len(problems) == 1 else k]
 
     def end(k: int, **outcome: Any) -> None:
         """End a search; where it did not fail, with the residuals and the Jacobian."""
-        search, (problem, sigmas) = running[k], problem_of(k)
+        search, problem = running[k], problem_of(k)
         if "failure" not in outcome:
             z, r, J = jnp.asarray(search.z).astype(problem.dtype), search.seen.residuals, search.seen.jacobian
             if r is None or J is None:
-                r, J = jacobian(problem, z, sigmas)
+                r, J = jacobian(problem, z)
             search = search._replace(z=z, seen=search.seen._replace(residuals=jnp.asarray(r), jacobian=jnp.asarray(J)))
             if not np.isfinite(J).all():
                 outcome |= {"failure": NO_DERIVATIVE, "converged": False}
@@ -177,16 +170,14 @@ def search_many(
                 waiting.clear()
             while waiting and len(running) < batch:
                 k = waiting.popleft()
-                problem, sigmas = problem_of(k)
                 z = jnp.asarray(starts[k], float)
-                running[k] = Search(z, optimiser.begin(problem, z, sigmas), unseen, ())
+                running[k] = Search(z, optimiser.begin(problem_of(k), z), unseen, ())
             if not running:
                 return dict(sorted(done.items()))
             running = _iterated(running, problem_of, stacked, optimiser, batch)
             for k, search in running.items():
                 if np.isfinite(search.cost) and np.isfinite(search.history[-1].gradient):
-                    _, sigmas = problem_of(k)
-                    report(sigmas, search)
+                    report(problem_of(k), search)
     except KeyboardInterrupt:
         for k in [k for k, search in running.items() if search.history]:
             end(k, interrupted=True)
@@ -196,7 +187,7 @@ def search_many(
 
 def _iterated(
     running: Mapping[int, Search],
-    problem_of: Callable[[int], tuple[FitProblem, Sigmas]],
+    problem_of: Callable[[int], FitProblem],
     stacked: tuple[Any, Any],
     optimiser: AbstractOptimiser,
     batch: int,
@@ -205,31 +196,28 @@ def _iterated(
     searches = list(running.values())
     if batch == 1:  # the program of a single search, which compiles in less time than a batch of one
         (k,), (search,) = running, searches
-        problem, sigmas = problem_of(k)
-        ends = [iterate(problem, optimiser, search.z, sigmas, search.inner)]
+        ends = [iterate(problem_of(k), optimiser, search.inner)]
     else:
         lanes = np.array([*range(len(searches)), *[0] * (batch - len(searches))])
         parts = [eqx.partition(search.inner, eqx.is_array) for search in searches]
-        z = np.stack([np.asarray(search.z) for search in searches])[lanes]
         rows = jax.tree.map(lambda *a: np.stack([np.asarray(each) for each in a])[lanes], *(a for a, _ in parts))
         varying = jax.tree.map(lambda a: a[np.array(list(running))[lanes]], stacked[0])
-        z, inner, seen = iterate_together(varying, stacked[1], optimiser, z, eqx.combine(rows, parts[0][1]))
+        inner, seen = iterate_together(varying, stacked[1], optimiser, eqx.combine(rows, parts[0][1]))
         arrays, rest = eqx.partition(inner, eqx.is_array)
-        whole = jax.tree.map(np.asarray, (z, arrays, seen))
+        whole = jax.tree.map(np.asarray, (arrays, seen))
         each = [jax.tree.map(lambda a, i=lane: a[i], whole) for lane in range(len(searches))]
-        ends = [(jnp.asarray(z), eqx.combine(part, rest), seen) for z, part, seen in each]
+        ends = [(eqx.combine(part, rest), seen) for part, seen in each]
     after = {}
-    for (k, search), (z, inner, seen) in zip(running.items(), ends, strict=True):
-        z, inner, seen = optimiser.directed(search, z, inner, seen)
+    for (k, search), end in zip(running.items(), ends, strict=True):
+        inner, seen = optimiser.directed(search, *end)
         cost, slope, history = float(seen.cost), float(np.abs(seen.gradient).max()), search.history
-        iteration = Iteration(len(history), cost, slope, not history or cost != history[-1].cost, np.asarray(z))
-        after[k] = Search(z, inner, seen, (*history, iteration))
+        iteration = Iteration(len(history), cost, slope, not history or cost != history[-1].cost, np.asarray(inner.z))
+        after[k] = Search(jnp.asarray(inner.z), inner, seen, (*history, iteration))
     return after
 
 
 def _stacked(trees: Sequence[Any]) -> tuple[Any, Any]:
-    """Trees that differ in numbers alone: one whose leaves that differ are stacked, shape (k, ...), without the others;
-    and one with the others, which are stored once. A single tree has no leaves that differ."""
+    """Trees that differ in numbers alone as one with what differs, stacked, shape (k, ...), and one with the others."""
     leaves, structures = zip(*(jax.tree.flatten(tree) for tree in trees), strict=True)
 
     def check(k: int, same: Any) -> None:
@@ -257,12 +245,9 @@ def _stacked(trees: Sequence[Any]) -> tuple[Any, Any]:
 
 
 def batch_size(problem: FitProblem, batch: int | None, count: int) -> int:
-    """How many points or searches of `count` to compute together. Default: eight with explicit steps, where they cost
-    less than one by one, and one with implicit ones, where all wait for the slowest solve (`benchmarks/multistart.py`).
-    """
-    if batch is not None:
-        return min(batch, count)
-    return min(8 if all(e.method.is_explicit for e in problem.experiments) else 1, count)
+    """How many of `count` points or searches to compute together. Default: eight with explicit steps, and one with
+    implicit ones, where all wait for the slowest solve (`benchmarks/multistart.py`)."""
+    return min(batch or (8 if all(e.method.is_explicit for e in problem.experiments) else 1), count)
 
 
 def counted(progress: Callable[[str], None] | None, text: str) -> Callable[[int, int], None]:
@@ -278,49 +263,40 @@ def counted(progress: Callable[[str], None] | None, text: str) -> Callable[[int,
     return say
 
 
-def iterate(
-    problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas, inner: Any
-) -> tuple[Coordinates, Any, Evaluation]:
+def iterate(problem: FitProblem, optimiser: AbstractOptimiser, inner: Any) -> tuple[Any, Evaluation]:
     """An optimiser's `iterate`, compiled, or what it asks for."""
     place = optimiser.place(problem, inner)
-    if place is None or (kept := parts_kept(problem, 1 + problem.size)) is None:
-        return iterate_alone(problem, optimiser, z, sigmas, inner)
-    return place, inner, evaluated(problem, place, sigmas, kept)
+    if place is None or (seen := evaluated(problem, place)) is None:
+        return iterate_alone(problem, optimiser, inner)
+    return inner, seen
 
 
 @eqx.filter_jit
-def iterate_alone(
-    problem: Any, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas, inner: Any
-) -> tuple[Coordinates, Any, Evaluation]:
+def iterate_alone(problem: FitProblem, optimiser: AbstractOptimiser, inner: Any) -> tuple[Any, Evaluation]:
     """An optimiser's `iterate`, compiled."""
-    return optimiser.iterate(problem, z, sigmas, inner)
+    return optimiser.iterate(problem, inner)
 
 
 # A batch stays one program, though three would serve other observations too: jax dispatches one program in a
 # millisecond, three under its transformations in ten, which a bootstrap of short runs pays hundreds of times.
 @eqx.filter_jit
-def iterate_together(
-    varying: Any, common: Any, optimiser: AbstractOptimiser, z: np.ndarray | Array, inner: Any
-) -> tuple[Array, Any, Evaluation]:
-    """An optimiser's `iterate` of b searches, compiled: the leaves in which problems and noises differ have a leading
-    axis b, like z and the optimiser's state."""
+def iterate_together(varying: Any, common: Any, optimiser: AbstractOptimiser, inner: Any) -> tuple[Any, Evaluation]:
+    """An optimiser's `iterate` of b searches, compiled: all that differs has a leading axis b."""
 
-    def one(varying: Any, z: Coordinates, inner: Any) -> tuple[Coordinates, Any, Evaluation]:
-        problem, sigmas = eqx.combine(varying, common)
-        return optimiser.iterate(problem, z, sigmas, inner)
+    def one(varying: Any, inner: Any) -> tuple[Any, Evaluation]:
+        return optimiser.iterate(eqx.combine(varying, common), inner)
 
-    return eqx.filter_vmap(one, in_axes=(0, 0, eqx.if_array(0)))(varying, z, inner)
+    return eqx.filter_vmap(one, in_axes=(0, eqx.if_array(0)))(varying, inner)
 
 
-def jacobian(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array]:
+def jacobian(problem: FitProblem, z: Coordinates) -> tuple[Array, Array]:
     """The residuals and their Jacobian, compiled."""
-    if problem.cheaper_mode == "forward" and (kept := parts_kept(problem, 1 + problem.size)) is not None:
-        at = evaluated(problem, z, sigmas, kept)
-        return jnp.asarray(at.residuals), jnp.asarray(at.jacobian)
-    return _jacobian(problem, z, sigmas)
+    if problem.cheaper_mode == "forward" and (seen := evaluated(problem, z)) is not None:
+        return jnp.asarray(seen.residuals), jnp.asarray(seen.jacobian)
+    return _jacobian(problem, z)
 
 
-_jacobian = eqx.filter_jit(lambda problem, z, sigmas: problem.jacobian(z, sigmas))
+_jacobian = eqx.filter_jit(lambda problem, z: problem.jacobian(z))
 
 NO_DERIVATIVE = "there is no derivative"
 _MOVES = 3  # how many moves must have lowered the cost by little

@@ -20,7 +20,7 @@ from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import Level, chosen_optimiser, fit, require_end
 from mpmjax.fitting._observation import AbstractTimed
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._problem import Coordinates, FitProblem, first_noise
 from mpmjax.fitting._result import FitResult
 from mpmjax.fitting._search import AbstractOptimiser, jacobian, search
 from mpmjax.fitting._starts import Starts, as_starts
@@ -48,13 +48,10 @@ def fit_staged(
 
     The first horizon, where `horizons` does not give it, is the last time until which a change of one in any coordinate
     changes the data by no more than they change themselves, √Σ (∂y/∂z)² ≤ √Σ (y − y(0))², at the first guess: of a
-    vibration about half a period. Where that ratio does not grow with time, as of a drop under gravity, there is but
-    one stage. Horizons then double, to the end, or to the time until which `sensitivity`, at each stage's values, is
-    below `growth`: later data are left out, and a warning says so.
-
-    The last stage is a `fit`, those before it are searches alone: parameters that the data do not see yet stay. Each
-    compiles anew. What has no times, such as a `Curve`, counts in the last stage, or in all if its experiment has
-    nothing else.
+    vibration about half a period. Where that ratio does not grow with time there is but one stage. Horizons then
+    double, to the end, or to the time until which `sensitivity` is below `growth`: later data are left out, with a
+    warning. The last stage is a `fit`, those before it are searches alone, each compiled anew. What has no times, such
+    as a `Curve`, counts in the last stage, or in all if its experiment has nothing else.
 
     Args:
         experiments, parameters, report, level: see `fit`. Horizons are times of each experiment.
@@ -81,8 +78,7 @@ def fit_staged(
         say(text)
 
     z = jnp.zeros(problem.size, problem.dtype)
-    limits = _limits(problem.at(z), float(growth))
-    whole = _cut(problem, limits, end)
+    whole = _until(problem, _limits(problem.at(z), float(growth)))
     if times is None:
         first = _first_horizon(whole, z)
         times = [first * 2.0**k for k in range(_MOST_STAGES) if first * 2.0**k < _NEARLY_ALL * end]
@@ -94,21 +90,20 @@ def fit_staged(
             "more than they change themselves, or by as much at all times."
         )
     for horizon in times:
-        cut = _cut(problem, limits, horizon)
+        cut = _until(whole, [horizon] * len(whole.experiments))
         if [e.steps for e in cut.experiments] == [e.steps for e in whole.experiments]:
             break
-        minimum = search(cut, optimiser, z, cut.first_sigmas)
+        minimum = search(cut, optimiser, z)
         require_end(minimum)
         if minimum.failure:
             cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
         z, misfit, count = minimum.z, cut.misfit(minimum.cost), len(minimum.history)
         tell(f"until {horizon:.4g} s: misfit/σ {misfit:.4g}, {problem.shown(z)}, {count} iterations")
-        limits = _limits(problem.at(z), float(growth))
-        whole = _cut(problem, limits, end)
-    for k, (e, used, limit) in enumerate(zip(problem.experiments, whole.experiments, limits, strict=True)):
+        whole = _until(problem, _limits(problem.at(z), float(growth)))
+    for k, (e, used) in enumerate(zip(problem.experiments, whole.experiments, strict=True)):
         if used.steps < e.steps:
             tell(
-                f"Of the experiment {e.name!r} (number {k}) data are used only until {limit:.4g} s of "
+                f"Of the experiment {e.name!r} (number {k}) data are used only until {used.t1:.4g} s of "
                 f"{e.t1:.4g} s: beyond, derivatives grow to more than {growth:.3g} times those of free flight, or "
                 "the simulation fails, and a fit would follow chance. Give windows of the later motion, each from an "
                 "observed state, as experiments of their own."
@@ -119,10 +114,10 @@ def fit_staged(
     return replace(result, remarks=tuple(remarks))
 
 
-def _cut(problem: FitProblem, limits: Sequence[float], horizon: float) -> FitProblem:
-    """The problem of the data until a horizon, and the limit of each experiment."""
-    each = zip(problem.experiments, limits, strict=True)
-    return eqx.tree_at(lambda p: p.experiments, problem, tuple(e.until(min(horizon, limit)) for e, limit in each))
+def _until(problem: FitProblem, horizons: Sequence[float]) -> FitProblem:
+    """The problem of the data until a horizon of each experiment [s]."""
+    cut = tuple(e.until(horizon) for e, horizon in zip(problem.experiments, horizons, strict=True))
+    return eqx.tree_at(lambda p: p.experiments, problem, cut).with_noise(first_noise(cut))
 
 
 def _limits(experiments: Sequence[Experiment], growth: float) -> list[float]:
@@ -141,11 +136,11 @@ def _limits(experiments: Sequence[Experiment], growth: float) -> list[float]:
 
 def _first_horizon(problem: FitProblem, z: Coordinates) -> float:
     """The time until which the data are nearly linear in the coordinates [s], see `fit_staged`."""
-    sigmas, parts = problem.first_sigmas, []
-    r, J = (np.asarray(a, float) for a in jacobian(problem, z, sigmas))
+    parts = []
+    r, J = (np.asarray(a, float) for a in jacobian(problem, z))
     if not np.isfinite(r).all():
         problem.explain(z)
-    for o, rows, sigma in zip(problem.observations, problem.rows, sigmas, strict=True):
+    for o, rows, sigma in zip(problem.observations, problem.rows, problem.sigmas, strict=True):
         if isinstance(o, AbstractTimed):
             change = (J[rows] ** 2).reshape(len(o.times), -1, problem.size).sum(axis=1)
             data = o.data.reshape(len(o.times), -1)
@@ -172,8 +167,7 @@ class RefinedFit(AbstractFit):
 
     fits: tuple[FitResult, ...]  # the fit on each grid, from coarse to fine
     refinements: tuple[int, ...]  # the spacing of the scene over that of each fit
-    estimates: tuple[Estimate, ...]
-    """The extrapolated numbers. Error and interval hold the noise's and the discretisation's part."""
+    estimates: tuple[Estimate, ...]  # the extrapolated numbers, with errors of the noise and of the discretisation
     from_noise: tuple[float, ...]  # the part of each error that the data's noise makes
     from_discretisation: tuple[float, ...]  # the part that is left of the discretisation
     order: tuple[float, ...]  # the order in the spacing with which each was extrapolated; NaN of what does not converge
@@ -224,13 +218,10 @@ def fit_refined(
     the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and that whole correction is the standard error that
     is left of the discretisation. p is `order`; three grids of equal ratios show it, between half and twice that, but
     the error is no less than by `order`. Where the estimates do not converge, or one is at its bound, the finest stays,
-    its last change the error, with a warning.
-
-    Two estimates may agree by chance, so the error is at least D/2 of those from the noise, D being what the finest
-    grid misses of the data, in units of σ: a discretisation that changes predictions by D in ways that no parameter
-    follows may do as much in ways that one does. D² is what Σ r² loses from the grid before, over r^2p − 1.
-
-    Intervals hold both parts, and keep to the bounds. After Ctrl-C it extrapolates from grids whose fit was done.
+    its last change the error, with a warning. Estimates may agree by chance, so the error is at least D/2 of those from
+    the noise, D being what the finest grid misses of the data, in units of σ: a discretisation may do as much in ways
+    that a parameter follows as in others. D² is what Σ r² loses from the grid before, over r^2p − 1. After Ctrl-C it
+    extrapolates from grids whose fit was done.
 
     Args:
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
@@ -264,9 +255,8 @@ def fit_refined(
     numbers = numbers[: len(fits)]
     if len(fits) < len(refinements):
         warn(f"The fit on several grids was interrupted: of {len(refinements)} grids it tells of {len(fits)}.")
-    missed, remark = 0.0, ""
-    if len(fits) > 1:
-        missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order))
+    missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order)) if len(fits) > 1 else 0.0
+    remark = ""
     if len(fits) > 1 and fits[-1].is_beyond:
         before, after = _squares(fits[-2].noise, fits[-1].noise)
         points, by_noise = (sum(n.points for n in fits[-1].noise if all_of or not n.estimated) for all_of in (1, 0))
@@ -284,8 +274,9 @@ def fit_refined(
     normal = float(quantile(float(level), np.inf))
     extrapolated = (_extrapolate(kind, of, numbers, float(order), missed, normal) for kind, of in each)
     estimates, left, orders = zip(*extrapolated, strict=True)
-    parts = {"from_noise": tuple(e.error for e in fits[-1].all), "from_discretisation": left, "order": orders}
-    return RefinedFit(fits=tuple(fits), refinements=tuple(numbers), estimates=estimates, **parts, remark=remark)
+    by_noise = tuple(e.error for e in fits[-1].all)
+    grids: dict[str, Any] = {"fits": tuple(fits), "refinements": tuple(numbers), "estimates": estimates}
+    return RefinedFit(**grids, from_noise=by_noise, from_discretisation=left, order=orders, remark=remark)
 
 
 def _squares(coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...]) -> tuple[float, float]:
@@ -297,8 +288,7 @@ def _squares(coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...])
 def _missed(
     coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...], refinements: list[int], order: float
 ) -> float:
-    """D, by how much the finest grid misses the data beyond their noise, in units of its σ: by what the sum of squares
-    lost since the grid before, as the square of what falls with the spacing to the power of the order."""
+    """D of `fit_refined`, by how much the finest grid misses the data beyond their noise, in units of its σ."""
     before, after = _squares(coarse, fine)
     return float(np.sqrt(max(before - after, 0.0) / ((refinements[-1] / refinements[-2]) ** (2 * order) - 1)))
 
@@ -311,9 +301,9 @@ def _extrapolate(
     missed: float,
     normal: float,
 ) -> tuple[Estimate, float, float]:
-    """One number extrapolated from its estimates on the grids, from coarse to fine; the part of its error that is left
-    of the discretisation; and the order, NaN where the estimates do not converge. `kind` is its parameter, None if it
-    was reported; `missed` as of `_missed`; `normal` the reach of a normal interval, in standard errors."""
+    """One number of a parameter (None if reported) extrapolated from its estimates from coarse to fine; the part of its
+    error that is left of the discretisation; and the order, NaN where the estimates do not converge. `missed` as of
+    `_missed`; `normal` the reach of a normal interval, in standard errors."""
     last = estimates[-1]
     if len(estimates) == 1:
         return last, float("nan"), float("nan")

@@ -14,7 +14,7 @@ from mpmjax.checks import between, require, require_fields, require_finite, whol
 from mpmjax.fitting._estimate import table
 from mpmjax.fitting._evaluation import costs_at
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas
+from mpmjax.fitting._problem import SHOWN, FitProblem
 from mpmjax.fitting._search import AbstractOptimiser, Search, batch_size, counted, search_many
 
 Ends = list[tuple[Search, list[int]]]  # minima, with the numbers of the points that led there
@@ -29,24 +29,21 @@ class Starts(eqx.Module):
     The points are the first guess, `points` of your own, and scrambled Sobol points (see `ranges`), a simulation each.
     Searches start from the first guess, your own points, the best of the others, and from each without a better one
     within the critical distance of multi-level single linkage (A. H. G. Rinnooy Kan, G. T. Timmer, Mathematical
-    Programming 39 (1987) 57-78). They stand for the others, each linked to the nearest better one, and linked anew
-    where that search comes to no minimum.
+    Programming 39 (1987) 57-78). They stand for the others, each linked to the nearest better one.
 
     A search that comes near another with a lower cost is counted where that one ends; one that three moves have hardly
     lowered is ended as at a minimum. Those within twice the least sum of squares are searched on, the best is fitted.
-    Two ended at one minimum where their coordinates differ by less than two hundredths, or the misfit hides that:
-    Δᵀ JᵀJ Δ ≤ n s² of n coordinates, with J and s² = Σ r²/(m − n) of the better one, s² at least one where σ is given.
-    Where it is not, all searches take that of the first one.
+    Two are one minimum where coordinates differ by less than two hundredths, or the misfit hides that: Δᵀ JᵀJ Δ ≤ n s²
+    of n coordinates, with J and s² = Σ r²/(m − n) of the better one, s² at least one where σ is given.
 
     Args:
         count: how many points, the first guess among them, your own not.
-        fraction: of the points, the best ones, from which searches start whatever is near. 1 searches from all of them,
-            without a look; 0 only from those of single linkage and the first guess.
+        fraction: of the points, the best ones, from which searches start whatever is near; 1 without a look at costs.
         ranges: lowest and highest value to start from, by the name of a parameter. Default: its prior, or its bounds,
             from a tenth to ten times the first guess of a `Positive`, one coordinate each way of an `Unbounded` one.
         points: values by the names of parameters, others at the first guess, from which a search starts in any case.
-        if_needed: look at them only where the misfit of the fit from the first guess is beyond the noise; searches then
-            run one by one, the best points first, until the misfit of one is within the noise.
+        if_needed: look at them only where the misfit of the first search is beyond the noise; searches then run one by
+            one, the best points first, until the misfit of one is within it.
         seed: of the Sobol points.
         batch: how many points, and searches, run together. Default: eight with explicit steps, one with implicit ones.
 
@@ -87,23 +84,16 @@ class Screening(eqx.Module):
     points: dict[str, np.ndarray]  # the values of each parameter, shape (k, ...); the first guess is number 0
     searched: tuple[int, ...]  # the numbers of the points from which searches started
     failures: dict[int, str]  # why the simulation at a point, or the search from it, failed, by the number of the point
-    unfinished: tuple[int, ...]
-    """The numbers of the points from which no search came to a minimum within the optimiser's steps."""
+    unfinished: tuple[int, ...]  # the numbers of the points from which no search came to a minimum in its steps
     iterations: int  # how many iterations all searches took
     remark: str  # what is to be said of it, in words; empty if nothing
 
     def __str__(self) -> str:
         """A table of the minima."""
-        minima, count = self.minima[:_SHOWN], len(next(iter(self.points.values())))
-        rows = [
-            (
-                f"{len(m.members):>24}",
-                f"{m.searches:>8}",
-                f"{m.misfit:>10.4g}",
-                *(f"{value.reshape(-1)[0]:>13.6g}" for value in list(m.values.values())[:SHOWN]),
-            )
-            for m in minima
-        ]
+        count, rows = len(next(iter(self.points.values()))), []
+        for m in self.minima[:_SHOWN]:
+            values = (f"{value.reshape(-1)[0]:>13.6g}" for value in list(m.values.values())[:SHOWN])
+            rows.append((f"{len(m.members):>24}", f"{m.searches:>8}", f"{m.misfit:>10.4g}", *values))
         labels = [f"{name if v.ndim == 1 else f'{name}, first':>13}" for name, v in self.points.items()][:SHOWN]
         lines = [f"{count} points, {len(self.searched)} searches, {self.iterations} iterations"]
         lines += table((f"{'points':>24}", "searches", f"{'misfit/σ':>10}", *labels), *rows)
@@ -122,17 +112,15 @@ def look_around(
     optimiser: AbstractOptimiser,
     starts: Starts,
     first: Search,
-    sigmas: Sigmas,
     enough: Callable[[Search], bool],
     progress: Callable[[str], None] | None,
 ) -> tuple[Search | None, Screening]:
-    """The best minimum of searches from many points, None where there is none better than that of the `first` search,
-    and what was found. `enough` says of a search whether others need not begin."""
+    """The best minimum of searches from many points, None where none is better than the `first`, and what was found."""
     shares = unit_points(starts.count - 1, problem.size, starts.seed)
     points = starting_points(problem, shares, starts)
     size, costs, remark = batch_size(problem, starts.batch, len(points)), np.zeros(len(points)), ""
     if starts.fraction < 1:
-        costs = costs_at(problem, points, sigmas, size, counted(progress, "{} of {} simulations are done"))
+        costs = costs_at(problem, points, size, counted(progress, "{} of {} simulations are done"))
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
     if 2 * len(failures) > len(points):
         try:
@@ -143,7 +131,7 @@ def look_around(
 
     # A program that makes one iteration is compiled already.
     size = 1 if starts.if_needed and starts.batch is None else size
-    search = partial(search_many, [(problem, sigmas)], optimiser, batch=size)
+    search = partial(search_many, [problem], optimiser, batch=size)
     members, stands = _searched(search, first, points, shares, costs, starts.fraction, enough, progress)
     failures |= {k: m.failure for k, m in members.items() if m.failure}
     ends: dict[int, list[int]] = {}
@@ -226,7 +214,7 @@ def _grouped(problem: FitProblem, ends: Ends) -> Ends:
             change = np.asarray(minimum.z - better.z, float)
             r, J = np.asarray(better.seen.residuals, float), np.asarray(better.seen.jacobian, float)
             variance = float((r**2).sum()) / max(np.count_nonzero(r) - len(change), 1)
-            variance = max(variance, 1.0 if all(problem.noise_is_given) else 0.0)
+            variance = max(variance, float(all(o.sigma is not None for o in problem.observations)))
             if (np.abs(change) <= _NEAR).all() or ((J @ change) ** 2).sum() <= len(change) * variance:
                 numbers += points
                 break
@@ -245,9 +233,7 @@ def unit_points(count: int, size: int, seed: int) -> Float[np.ndarray, "k n"]:
 
 
 def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], starts: Starts) -> Float[np.ndarray, "l n"]:
-    """Coordinates of the first guess, of the points of `starts`, and of points of the unit cube, its sides as its
-    `ranges` say. The range of a positive parameter is one of its logarithm.
-    """
+    """Coordinates of the first guess, of the points of `starts`, and of points of the unit cube within its `ranges`."""
     ranges, points = starts.ranges or {}, {f"Start {k}": point for k, point in enumerate(starts.points)}
     for what, values in {"ranges": ranges, **points}.items():
         unknown = sorted(set(values) - set(problem.names))
@@ -298,12 +284,9 @@ def _coordinates(parameter: AbstractParameter, start: Array, values: np.ndarray 
 
 
 def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], fraction: Scalar) -> Int[np.ndarray, "k"]:
-    """For each point the number of the one that stands for it, from which a search starts; its own where one starts
-    there, and -1 where the cost is not finite.
-
-    This is multi-level single linkage (see `Starts`) of points that are evenly spread over the unit cube, `shares`. On
-    a rough function its starts are too few: a fraction of all points, the best ones, start besides.
-    """
+    """For each of some points of the unit cube, `shares`, the number of the one that stands for it by multi-level
+    single linkage (see `Starts`): its own where a search starts there, as at the best fraction of all, and -1 where the
+    cost is not finite."""
     count, size = shares.shape
     stands = np.full(count, -1)
     usable = np.isfinite(costs)
@@ -318,8 +301,7 @@ def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], frac
 
 
 def critical_distance(count: int, size: int) -> float:
-    """π^(-1/2) (Γ(1 + n/2) σ ln k / k)^(1/n): the radius of a ball in which σ ln k of k even points of the unit cube of
-    n dimensions lie, but for its boundary."""
+    """π^(-1/2) (Γ(1 + n/2) σ ln k / k)^(1/n): the radius of a ball that holds σ ln k of k points of the n-cube."""
     if count < 2:
         return 0.0
     logarithm = math.lgamma(1 + size / 2) + np.log(_SIGMA * np.log(count) / count)

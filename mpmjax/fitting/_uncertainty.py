@@ -7,8 +7,7 @@ import numpy as np
 
 from mpmjax.checks import warn
 
-_ROUNDINGS = 1e3
-"""Singular values of J, its columns of length one, below so many roundings of the largest are of unseen directions."""
+_ROUNDINGS = 1e3  # of the largest singular value of J, its columns of length one: smaller ones are of unseen directions
 _SHARE = 1e-6  # part of a unit vector below which it does not lie in a direction
 _LEAST_FREEDOM = 1e-3  # degrees of freedom below which there are none, but rounding
 _AT_BOUND = 1e-2  # standard errors from a bound at which a number lies at it
@@ -22,15 +21,12 @@ _PART = 0.1  # share of a direction's largest effect on the data from which a co
 class Uncertainty(NamedTuple):
     """The covariance of n coordinates at a minimum, by the Gauss-Newton Hessian."""
 
-    inverse: np.ndarray
-    """The covariance [-] but in directions that the data do not see, shape (n, n); of noise alone (JᵀJ)⁺."""
+    inverse: np.ndarray  # the covariance [-] but in directions that the data do not see, shape (n, n)
     unseen: np.ndarray  # directions that the data do not see, one a column, shape (n, u)
-    weak: np.ndarray
-    """Directions that the data hardly see, a tenth as well as each coordinate alone, one a column, shape (n, w)."""
+    weak: np.ndarray  # directions seen a tenth as well as each coordinate alone, one a column, shape (n, w)
     spectrum: np.ndarray  # the eigenvalues of the Fisher information JᵀJ, growing, shape (n,)
     directions: np.ndarray  # their eigenvectors, one a column, shape (n, n)
-    parts: tuple[np.ndarray, ...]
-    """The part of the covariance that each observation brings, and last, if known, the discretisation, (n, n)."""
+    parts: tuple[np.ndarray, ...]  # what each observation brings to it, and last, if known, the discretisation, (n, n)
     freedoms: tuple[float, ...]  # degrees of freedom of the noise of each; infinite where it is known
 
     @property
@@ -67,11 +63,10 @@ class Uncertainty(NamedTuple):
         return correlation
 
     def of(self, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The standard errors of numbers with these gradients by the coordinates, shape (..., n), and their degrees of
-        freedom, both of shape (...). An error is infinite where a gradient has a part in a direction that the data do
-        not see. The degrees of freedom are infinite where all noise is known, else by Welch and Satterthwaite (B. L.
-        Welch, Biometrika 34 (1947) 28, doi 10.1093/biomet/34.1-2.28), (Σ_k v_k)²/Σ_k v_k²/ν_k with the variances v_k
-        that the observations bring."""
+        """The standard errors of numbers with these gradients by the coordinates, shape (..., n), infinite where one
+        has a part in a direction that the data do not see; and their degrees of freedom, both of shape (...): infinite
+        where all noise is known, else by Welch and Satterthwaite (B. L. Welch, Biometrika 34 (1947) 28,
+        doi 10.1093/biomet/34.1-2.28), (Σ_k v_k)²/Σ_k v_k²/ν_k with the variances v_k that the observations bring."""
         size = np.linalg.norm(gradient, axis=-1).max(initial=0)
         depends = np.abs(gradient @ self.unseen).max(axis=-1, initial=0) > _SHARE * size
         variance = quadratic(gradient, self.inverse)
@@ -100,8 +95,7 @@ def _ratio(a: Any, b: Any) -> np.ndarray:
 
 
 def quantile(level: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray:
-    """How many standard errors an interval of this level reaches to each side: of Student's t, or with infinite degrees
-    of freedom of the normal distribution."""
+    """How many standard errors an interval of this level reaches to each side, of Student's t, normal if infinite."""
     p, normal = (1 + level) / 2, np.isinf(degrees_of_freedom)
     from scipy.special import ndtri, stdtrit  # here, since it takes long to import
 
@@ -144,8 +138,8 @@ def uncertainty(
 
 
 def at_bound(r: np.ndarray, J: np.ndarray, room: np.ndarray) -> np.ndarray:
-    """Whether each coordinate's value lies at a bound: the data want to go beyond, and it is a hundredth of its
-    standard error away from it, were all others known, shape (n,). Room is as of `FitProblem.room`."""
+    """Whether each coordinate's value lies at a bound, shape (n,): the data want to go beyond, and it is a hundredth of
+    its standard error away, were all others known. Room is as of `FitProblem.room`."""
     length = np.maximum(np.linalg.norm(J, axis=0), np.finfo(float).tiny)
     error = np.sqrt((r**2).sum() / max(len(r) - len(length), 1))
     wanted = np.stack([J.T @ r, -J.T @ r]) / length
@@ -155,9 +149,9 @@ def at_bound(r: np.ndarray, J: np.ndarray, room: np.ndarray) -> np.ndarray:
 def noise(
     r: np.ndarray, J: np.ndarray, rows: slice, count: int, weight: float, robust: float | None
 ) -> tuple[float, float]:
-    """The factor by which an observation's noise is larger than was assumed, and its degrees of freedom: the `count`
-    of its measured numbers less the share of the parameters that it fixes, m − tr(J_k (JᵀJ)⁻¹ J_kᵀ). NaN where that
-    leaves none. The observation has some rows of r and J, a weight of its squares, and may have a robust limit."""
+    """The factor by which the noise of an observation, some rows of r and J, is larger than was assumed, and its
+    degrees of freedom: the `count` of its measured numbers less the share of the parameters that it fixes,
+    m − tr(J_k (JᵀJ)⁻¹ J_kᵀ). NaN where that leaves none."""
     U, singular, _ = np.linalg.svd(J / np.maximum(np.linalg.norm(J, axis=0), np.finfo(float).tiny), full_matrices=False)
     seen = singular > 1e-8 * singular.max(initial=0)
     freedom = count - float((U[rows][:, seen] ** 2).sum())
@@ -175,8 +169,7 @@ def _mean_square(robust: float | None) -> float:
 
 
 def seen_together(labels: tuple[str, ...], errors: Uncertainty, logarithmic: tuple[bool, ...]) -> list[str]:
-    """Directions in which the coordinates may change and the data do not, or hardly, in words; `logarithmic` says which
-    coordinates are logarithms of their values."""
+    """Directions in which coordinates, or logarithms, may change and the data do not, or hardly, in words."""
     length, correlation, texts = np.where(np.isinf(errors.alone), 1, 1 / errors.alone), errors.correlation, []
     for columns, weak in ((errors.unseen, False), (errors.weak, True)):
         effects = columns * length[:, None]  # on the data
@@ -221,8 +214,7 @@ class Prediction(NamedTuple):
 
     value: np.ndarray  # the quantity at the fit
     error: np.ndarray  # standard error; infinite where the value depends on what the data do not see
-    lower: np.ndarray
-    """Where the value lies at the level: the confidence band. It holds at each point, not at all of them together."""
+    lower: np.ndarray  # where the value lies at the level: the confidence band, of each point by itself
     upper: np.ndarray  # the band's upper end
     sigma: np.ndarray | None  # standard deviation of the noise of a measurement of it, where that is known
     new_lower: np.ndarray | None  # where a new measurement lies at the level, its noise included: the prediction band
@@ -233,8 +225,8 @@ class Prediction(NamedTuple):
 def banded(
     errors: Uncertainty, level: float, value: Any, J: Any, sigma: np.ndarray | None = None, number: int | None = None
 ) -> Prediction:
-    """Values with their bands, by their derivative J, shape (..., n). `sigma` is the noise of new measurements, if that
-    is known, `number` that of their observation, if they are of one."""
+    """Values with their bands, by their derivative J, shape (..., n), and by the noise of new measurements, if known,
+    of the observation of a number, if they are of one."""
     mean, gradient = np.asarray(value, float), np.asarray(J, float)
     has_derivative = np.asarray(np.isfinite(gradient).all(axis=-1))
     gradient = np.where(has_derivative[..., None], gradient, 0)

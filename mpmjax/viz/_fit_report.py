@@ -107,7 +107,7 @@ def _draw(
 
 def _draw_residuals(axis: Any, observation: AbstractObservation, predicted: Prediction, last: float) -> None:
     """Residuals of the components that were measured, in units of the noise; those fitted end at `last`."""
-    shown, (name, against) = observation.picture, observation.against
+    shown, (name, against) = observation.shown, observation.against
     x = shown.along(against)
     if predicted.sigma is not None:
         axis.axhspan(-2, 2, color="0.93", linewidth=0)
