@@ -1,21 +1,19 @@
 // All kernels for one instruction set, MPMJAX_TARGET, and one type of numbers, MPMJAX_NUMBER: each pair is compiled by
 // itself, at the same time as others and in a part of the memory. Without a type, both.
 
-#include "gather.h"
+#include "decompositions.h"
 #include "kernels.h"
 #include "passes.h"
 #include "resist.h"
-#include "scatter.h"
-#include "decompositions.h"
 
 namespace {
 
 using mpmjax::Kernels;
 
 template <class T, int d, int s>
-constexpr Kernels<T> sums_of = {gather<T, d, s>, scatter<T, d, s>, average<T, d, s>,         find_ranges<T, d, s>,
-                                pull<T, d, s>,   resist<T, d, s>,  resist_particles<T, d, s>,
-                                p2g<T, d, s>,    g2p<T, d, s>};
+constexpr Kernels<T> sums_of = {{gather<T, d, s>, pull<T, d, s>, g2p<T, d, s>, scatter<T, d, s>, average<T, d, s>,
+                                 p2g<T, d, s>, resist<T, d, s>},
+                                find_ranges<T, d, s>};
 
 template <class T>
 const Kernels<T>* sums(int d, int s) {
