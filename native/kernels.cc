@@ -27,18 +27,14 @@ const Kernels<T>* sums(int d, int s) {
 
 namespace mpmjax {
 
-#define MPMJAX_JOINED(a, b) a##_##b
-#define MPMJAX_NAME(target, number) MPMJAX_JOINED(target, number)
-#define MPMJAX_SET(number)                                           \
-  extern const KernelSet<number> MPMJAX_NAME(MPMJAX_TARGET, number); \
-  const KernelSet<number> MPMJAX_NAME(MPMJAX_TARGET, number) = {sums<number>, ::eigen<number>, ::rotation<number>, \
-                                                                ::combine<number>, ::product<number>};
+template <class Target, class T>
+const KernelSet<T> Compiled<Target, T>::kernels = {sums<T>, ::eigen<T>, ::rotation<T>, ::combine<T>, ::product<T>};
 
 #if defined(MPMJAX_NUMBER)
-MPMJAX_SET(MPMJAX_NUMBER)
+template struct Compiled<MPMJAX_TARGET, MPMJAX_NUMBER>;
 #else
-MPMJAX_SET(float)
-MPMJAX_SET(double)
+template struct Compiled<MPMJAX_TARGET, float>;
+template struct Compiled<MPMJAX_TARGET, double>;
 #endif
 
 }  // namespace mpmjax

@@ -36,6 +36,15 @@ struct KernelSet {
   double (*product)(const Product<T>&, int64_t first, int64_t last);
 };
 
+// Those that are compiled for an instruction set.
+struct avx2;
+struct avx512;
+struct baseline;
+template <class Target, class T>
+struct Compiled {
+  static const KernelSet<T> kernels;
+};
+
 // The kernels of the best instruction set that this machine has, of those that they are compiled for.
 template <class T>
 const KernelSet<T>& kernels();
