@@ -30,25 +30,12 @@ std::string name_of(const Shape& sh) {
   return name;
 }
 
-// The sizes of a sum, and random polynomials.
 template <template <class> class Problem, class T>
 Problem<T> sized(const Shape& sh, int64_t columns) {
-  Random random(sh.seed);
-  std::uniform_real_distribution<float> half(-0.5f, 0.5f);
-  std::normal_distribution<float> normal;
   Problem<T> task = {};
-  Basis<T>& basis = task.stencils.basis;
-  basis.d = sh.d, basis.s = sh.s, basis.terms = sh.s + 1;
-  task.stencils.particles = sh.particles, task.size = 1, task.columns = columns;
-  for (int a = sh.d - 1; a >= 0; --a, task.size *= sh.along) {
-    basis.shape[a] = int32_t(sh.along), basis.strides[a] = int32_t(task.size), basis.periodic[a] = random() % 4 == 0;
-  }
-  for (int i = 0; i < sh.s; ++i) {
-    basis.knots[i] = half(random);
-    for (int k = 0; k < basis.terms; ++k) {
-      basis.weights[i][k] = normal(random) / 4, basis.slopes[i][k] = normal(random) / 4;
-    }
-  }
+  task.stencils.basis = basis_of<T>(sh.d, sh.s, sh.along, Random(sh.seed));
+  task.stencils.particles = sh.particles;
+  task.size = task.stencils.basis.strides[0] * sh.along, task.columns = columns;
   return task;
 }
 
@@ -201,29 +188,28 @@ void check_p2g(const Shape& sh, const Pools& pools) {
     const Example<Average<double>> expected(sizes, sh.batch, random);
     const Average<double>& made = expected.task;
     place(task.stencils, sh, random), place_alike(task.stencils, made.stencils, sh.batch);
-    for (int64_t i = 0; i < sh.batch * p; ++i) changed(task.mass)[i] = 1 + std::abs(task.mass[i]);
     for (int64_t b = 0; b < sh.batch; ++b) {
       changed(made.least)[b] = changed(task.least)[b] = 1 + std::abs(task.least[b]);
       changed(task.slope)[b] = 1 + std::abs(task.slope[b]);
-      for (int64_t k = 0; k < p; ++k) {
-        const auto at = [&](const auto* array, int64_t rows, int64_t row) -> auto& {
-          return changed(array)[(b * rows + row) * p + k];
-        };
-        const double mass = at(task.mass, 1, 0), q = at(task.q, 1, 0), r = at(task.r, 1, 0);
-        for (int i = 0; i <= d; ++i) at(made.values.value, d + 1, i) = i < d ? mass * at(task.v, d, i) : mass;
-        for (int c = 0; c < d; ++c) {
-          const double t = at(task.stencils.offset, d, c);
-          const double moment = sh.s == 2 ? 0.25 - t * t : sh.s == 3 ? 1 / 4.0 : 1 / 3.0;
-          for (int i = 0; i < d; ++i) {
-            double product = isotropic ? (i == c ? r : 0) : factored ? 0 : at(task.A, m, d * i + c);
-            for (int l = 0; l < d && factored; ++l) {
-              const double a = isotropic ? q * at(task.B, m, d * i + l) : at(task.A, m, d * i + l);
-              product += a * at(task.B, m, d * c + l);
-            }
-            const double turned = affine ? mass * at(task.C, m, d * i + c) * moment / task.slope[b] : 0;
-            at(made.values.gradients, m, d * c + i) =
-                turned + (pushed ? product * double(task.factor[b]) * task.slope[b] : 0);
+    }
+    for (int64_t i = 0; i < sh.batch * p; ++i) {
+      const int64_t b = i / p;
+      const auto at = [&](const auto* array, int64_t rows, int64_t row) -> auto& {
+        return changed(array)[(b * rows + row) * p + i % p];
+      };
+      const double mass = changed(task.mass)[i] = 1 + std::abs(task.mass[i]);
+      for (int k = 0; k <= d; ++k) at(made.values.value, d + 1, k) = k < d ? mass * at(task.v, d, k) : mass;
+      for (int c = 0; c < d; ++c) {
+        const double t = at(task.stencils.offset, d, c);
+        const double moment = sh.s == 2 ? 0.25 - t * t : sh.s == 3 ? 1 / 4.0 : 1 / 3.0;
+        for (int k = 0; k < d; ++k) {
+          double pushes = isotropic && k == c ? task.r[i] : 0;
+          for (int l = 0; l < d && pushed; ++l) {
+            const auto B = [&](int row) { return factored ? double(at(task.B, m, d * row + l)) : row == l; };
+            pushes += (!isotropic ? at(task.A, m, d * k + l) : kind == 4 ? task.q[i] * B(k) : 0) * B(c);
           }
+          const double turns = affine ? mass * at(task.C, m, d * k + c) * moment / task.slope[b] : 0;
+          at(made.values.gradients, m, d * c + k) = turns + pushes * double(task.factor[b]) * task.slope[b];
         }
       }
     }

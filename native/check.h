@@ -75,12 +75,14 @@ inline void expect(bool holds, const std::string& what) {
   if (!holds && ++faults < 20) std::printf("%s\n", what.c_str());
 }
 
-// Compares numbers with what they should be, to so many roundings of the largest of these. What is not finite must be
-// so in both.
+// Compares numbers with what they should be, to so many roundings of the largest of these, or of what it is at least.
+// What is not finite must be so in both.
 template <class T>
-void compare(const std::string& what, const T* result, const double* expected, int64_t count, double roundings) {
-  double largest = 0;
-  for (int64_t i = 0; i < count; ++i) largest = std::max(largest, std::isfinite(expected[i]) * std::abs(expected[i]));
+void compare(const std::string& what, const T* result, const double* expected, int64_t count, double roundings,
+             double largest = 1) {
+  for (int64_t i = 0; i < count; ++i) {
+    if (std::isfinite(expected[i])) largest = std::max(largest, std::abs(expected[i]));
+  }
   const double tolerance = roundings * std::numeric_limits<T>::epsilon() * largest;
   int64_t i = 0;
   const auto right = [&] {
@@ -90,6 +92,21 @@ void compare(const std::string& what, const T* result, const double* expected, i
   if (i == count) return;
   expect(false, what + "[" + std::to_string(i) + "] is " + std::to_string(result[i]) +
                     ", expected " + std::to_string(expected[i]));
+}
+
+// Nodes along each axis of a window, some of them periodic, and random polynomials.
+template <class T>
+Basis<T> basis_of(int d, int s, int64_t along, Random random) {
+  std::normal_distribution<float> normal;
+  Basis<T> basis = {d, s, {}, {}, {}, s + 1, {}, {}, {}};
+  for (int64_t a = d - 1, stride = 1; a >= 0; --a, stride *= along) {
+    basis.shape[a] = int32_t(along), basis.strides[a] = int32_t(stride), basis.periodic[a] = random() % 4 == 0;
+  }
+  for (int i = 0; i < s; ++i) {
+    basis.knots[i] = normal(random) / 3;
+    for (int k = 0; k <= s; ++k) basis.weights[i][k] = normal(random) / 4, basis.slopes[i][k] = normal(random) / 4;
+  }
+  return basis;
 }
 
 // An array that ends where its memory ends.

@@ -1,5 +1,6 @@
 // Checks the passes over arrays: vectors of a solve, solves, decompositions of matrices, and the order of numbers.
 
+#include <array>
 #include <numeric>
 
 #include "check.h"
@@ -67,6 +68,16 @@ void check_products(int64_t nodes, int64_t each, const Pools& pools) {
   compare("a product's sum", task.sum, sum.data(), kBatch, 1000);
 }
 
+using Matrix = std::array<double, 9>;
+
+Matrix transposed(const Matrix& a) { return {a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8]}; }
+
+Matrix operator*(const Matrix& a, const Matrix& b) {
+  Matrix c = {};
+  for (int i = 0; i < 27; ++i) c[i / 9 * 3 + i % 3] += a[i / 9 * 3 + i / 3 % 3] * b[i / 3 % 3 * 3 + i % 3];
+  return c;
+}
+
 // A = V diag(w) Vᵀ and F = R S of random matrices, of all magnitudes, with repeated eigenvalues, of zeros alone. V and
 // R are rotations, and S is symmetric. What is not finite spoils its own particle alone.
 template <class T>
@@ -86,38 +97,27 @@ void check_matrices(int64_t particles, const Pools& pools) {
     changed(eigen.task.matrices)[i] = matrices[i];
   }
   eigen.run_by_all(pools, "eigen"), rotation.run_by_all(pools, "rotation");
-  for (int64_t b = 0; b < kBatch * particles; ++b) {
+  for (int64_t i = 0; i < kBatch * particles; ++i) {
     const auto at = [&](const T* from, int rows, int row) {
-      return double(from[(b / particles * rows + row) * particles + b % particles]);
+      return double(from[(i / particles * rows + row) * particles + i % particles]);
     };
-    // A, V diag(w) Vᵀ, and VᵀV, RᵀR; RᵀF and its transpose.
-    T rebuilt[9], squares[18], stretch[9];
-    double A[9], one[18], transposed[9];
-    for (int i = 0; i < 3; ++i) {
-      for (int j = 0; j < 3; ++j) {
-        double a = 0, v = 0, r = 0, s = 0, t = 0;
-        for (int l = 0; l < 3; ++l) {
-          const auto V = [&](int row, int column) { return at(eigen.task.vectors, 9, 3 * row + column); };
-          const auto R = [&](int row, int column) { return at(rotation.task.rotations, 9, 3 * row + column); };
-          const auto F = [&](int row, int column) { return at(matrices, 9, 3 * row + column); };
-          a += V(i, l) * at(eigen.task.values, 3, l) * V(j, l);
-          v += V(l, i) * V(l, j), r += R(l, i) * R(l, j);
-          s += R(l, i) * F(l, j), t += R(l, j) * F(l, i);
-        }
-        const int k = 3 * i + j;
-        A[k] = at(matrices, 9, 3 * std::min(i, j) + std::max(i, j)), one[k] = one[9 + k] = i == j, transposed[k] = t;
-        rebuilt[k] = T(a), squares[k] = T(v), squares[9 + k] = T(r), stretch[k] = T(s);
-      }
+    Matrix F, V, R, w = {};
+    for (int k = 0; k < 9; ++k) {
+      F[k] = at(matrices, 9, k), V[k] = at(eigen.task.vectors, 9, k), R[k] = at(rotation.task.rotations, 9, k);
+      if (k % 4 == 0) w[k] = at(eigen.task.values, 3, k / 4);
     }
-    double size = 0;
-    for (int k = 0; k < 9; ++k) size += at(matrices, 9, k);
-    if (std::isfinite(size)) {
-      compare("V diag(w) Vt", rebuilt, A, 9, 64);
-      compare("VtV, RtR", squares, one, 18, 64);
-      compare("RtF", stretch, transposed, 9, 64);
-    } else {
-      expect(!std::isfinite(squares[9]) && !std::isfinite(at(eigen.task.values, 3, 0)), "a matrix that is not finite");
+    if (std::isnan(F[0])) {
+      expect(std::isnan(w[0]) && std::isnan(R[0]), "a matrix that is not finite");
+      continue;
     }
+    const Matrix A = {F[0], F[1], F[2], F[1], F[4], F[5], F[2], F[5], F[8]}, one = {1, 0, 0, 0, 1, 0, 0, 0, 1};
+    const Matrix S = transposed(R) * F;
+    const double roundings = 64 * std::numeric_limits<T>::epsilon() / std::numeric_limits<double>::epsilon();
+    const auto agree = [&](const char* what, const Matrix& result, const Matrix& expected) {
+      compare(what, result.data(), expected.data(), 9, roundings, 0);
+    };
+    agree("V diag(w) Vt", V * w * transposed(V), A);
+    agree("VtV", transposed(V) * V, one), agree("RtR", transposed(R) * R, one), agree("RtF", S, transposed(S));
   }
 }
 
@@ -174,15 +174,8 @@ void check_solve(int d, int64_t particles, int64_t along, const Pools& pools) {
   Random random(1);
   std::uniform_real_distribution<T> some(1, 2);
   Solve<T> sizes = {};
-  Basis<T>& basis = sizes.stencils.basis;
-  sizes.stencils.particles = particles, sizes.nodes = 1;
-  basis.d = d, basis.s = 3, basis.terms = 3;
-  for (int a = d - 1; a >= 0; --a, sizes.nodes *= along) {
-    basis.shape[a] = int32_t(along), basis.strides[a] = int32_t(sizes.nodes);
-  }
-  for (int i = 0; i < 3; ++i) {
-    for (int k = 0; k < 3; ++k) basis.weights[i][k] = some(random) / 4, basis.slopes[i][k] = some(random) - T(1.5);
-  }
+  sizes.stencils.basis = basis_of<T>(d, 3, along, random);
+  sizes.stencils.particles = particles, sizes.nodes = sizes.stencils.basis.strides[0] * along;
   const int64_t size = sizes.nodes * d, blocks = blocks_of(size);
   for (const int64_t room : {int64_t(0), kVectors * size}) {
     sizes.room = room;
