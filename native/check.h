@@ -8,7 +8,6 @@
 #include <condition_variable>
 #include <cstdio>
 #include <cstring>
-#include <deque>
 #include <limits>
 #include <memory>
 #include <mutex>
@@ -26,47 +25,33 @@ namespace mpmjax {
 using Random = std::mt19937;
 using Pools = std::vector<const Pool*>;
 
+// A thread for each task.
 class Threads : public Pool {
  public:
-  explicit Threads(int count) : count_(count) {
-    for (int i = 1; i < count; ++i) threads_.emplace_back([this] { work(); });
-  }
+  explicit Threads(int count) : count_(count) {}
   ~Threads() override {
-    {
-      const std::lock_guard<std::mutex> lock(mutex_);
-      ended_ = true;
-    }
-    changed_.notify_all();
-    for (std::thread& thread : threads_) thread.join();
+    std::unique_lock<std::mutex> lock(mutex_);
+    ended_.wait(lock, [this] { return running_ == 0; });
   }
   int threads() const override { return count_; }
   void schedule(std::function<void()> task) const override {
     {
       const std::lock_guard<std::mutex> lock(mutex_);
-      tasks_.push_back(std::move(task));
+      ++running_;
     }
-    changed_.notify_one();
+    std::thread([this, task] {
+      task();
+      const std::lock_guard<std::mutex> lock(mutex_);
+      --running_;
+      ended_.notify_all();
+    }).detach();
   }
 
  private:
-  void work() {
-    for (;;) {
-      std::unique_lock<std::mutex> lock(mutex_);
-      changed_.wait(lock, [this] { return ended_ || !tasks_.empty(); });
-      if (ended_) return;
-      const std::function<void()> task = std::move(tasks_.front());
-      tasks_.pop_front();
-      lock.unlock();
-      task();
-    }
-  }
-
   int count_;
-  bool ended_ = false;
+  mutable int running_ = 0;
   mutable std::mutex mutex_;
-  mutable std::condition_variable changed_;
-  mutable std::deque<std::function<void()>> tasks_;
-  std::vector<std::thread> threads_;
+  mutable std::condition_variable ended_;
 };
 
 inline std::atomic<int> faults{0};
@@ -137,11 +122,11 @@ struct Example {
       int64_t count = batch;
       for (const Length& n : shape) count *= n.value;
       const size_t size = count * sizeof(X);
-      arrays.push_back({std::unique_ptr<char[]>(new char[size]()), count, size, std::is_floating_point_v<X>,
+      arrays.push_back({std::unique_ptr<char[]>(new char[size]), count, size, std::is_floating_point_v<X>,
                         !std::is_const_v<Element>});
       X* const numbers = arrays.back().template as<X>();
-      for (int64_t i = 0; i < count && !std::is_same_v<X, int32_t>; ++i) {
-        numbers[i] = std::is_same_v<X, bool> ? random() % 3 > 0 : X(normal(random));
+      for (int64_t i = 0; i < count; ++i) {
+        numbers[i] = std::is_same_v<X, bool> ? random() % 3 > 0 : std::is_same_v<X, int32_t> ? 0 : X(normal(random));
       }
       array = numbers;
     });
