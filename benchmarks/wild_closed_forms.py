@@ -198,15 +198,16 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def fit_all(cases: dict[str, Callable[[], Case]], description: str | None) -> None:
+    """Fit those that the command line asks for, and print a line a number."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="parts of the names, parted by commas")
     parser.add_argument("--draws", type=int, default=1, help="of the noise; 0: none")
     parser.add_argument("--tables", action="store_true", help="print the whole results")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     warnings.simplefilter("ignore")
-    for name, build in CASES.items():
+    for name, build in cases.items():
         if not any(part in name for part in asked.only.split(",")):
             continue
         case = build()
@@ -221,7 +222,9 @@ def main() -> None:
             seen = mpm.Tracks(times, x + shaken, which=which, sigma=sigma)
             e = mpm.Experiment(case.scene, case.particles, t1=case.t1, dt=case.dt, observations=seen)
             numbers = {
-                label: mpm.Positive(where, start=truth * 10 ** rng.uniform(-0.5, 0.5))
+                label: mpm.Bounded(where, upper=0.49, start=rng.uniform(0.1, 0.4))
+                if label == "nu"
+                else mpm.Positive(where, start=truth * 10 ** rng.uniform(-0.5, 0.5))
                 for label, (where, truth) in case.fitted.items()
             }
             try:
@@ -244,4 +247,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    fit_all(CASES, __doc__)

@@ -242,6 +242,12 @@ def test_annotations_say_what_must_hold_of_values(make, values, says):
         make(**values)
 
 
+@pytest.mark.parametrize(("args", "values"), [((2.0,), {}), ((), {"shear": 2.0})])
+def test_a_call_that_does_not_fit_names_the_function_and_what_it_takes(args, values):
+    with pytest.raises(TypeError, match=r"^marked takes modulus, share: "):
+        marked(*args, **values)
+
+
 def test_a_mark_on_a_traced_field_is_put_off():
     """Until a compiled program can evaluate it."""
 

@@ -19,7 +19,7 @@ from scipy.stats import norm, t
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._result import fit_result
-from mpmjax.fitting._search import Search, search_many
+from mpmjax.fitting._search import Search, search, search_many
 from mpmjax.fitting._uncertainty import _mean_square, noise, seen_together, uncertainty
 from mpmjax.viz import write_fit
 
@@ -280,6 +280,22 @@ def test_a_search_that_meets_a_kink_ends_soon_says_so_and_holds_the_step_left_un
     assert np.ptp(estimate.noise_interval) < 0.4
 
 
+class Bent(Kinked):
+    """100 z and 100 + 95 z²/2: Σ r² is 1.95 times as curved as straight lines say, so that each of their steps ends
+    nearly as far beyond the minimum as it began before it."""
+
+    def residuals(self, z, sigmas, adjoint):
+        return 100 * jnp.zeros(STEPS).at[0].set(z[0]).at[1].set(1 + 0.95 * z[0] ** 2 / 2), jnp.zeros(1)
+
+
+def test_a_search_does_not_swing_from_side_to_side_of_a_minimum():
+    lm = mpm.fitting.LevenbergMarquardt()
+    found = search_many([(Bent(0.0), (jnp.ones(()),))], lm, {0: np.ones(1)})[0]
+    assert found.converged
+    assert float(found.z[0]) == pytest.approx(0.0, abs=1e-3)
+    assert len(found.history) < 15
+
+
 class Line(FitProblem):
     """A straight line in the place of a simulation: y = A (a, b), σ = 1."""
 
@@ -320,6 +336,21 @@ def beside_a_bound(name, offset, count):
     ends = search_many(each, lm, dict.fromkeys(range(count), np.zeros(2)), batch=count)
     results = [fit_result(problem, lm, ends[k], GIVEN_NOISE, {}, 0.95) for k, problem in enumerate(problems)]
     return truth, y, results
+
+
+@pytest.mark.parametrize("name", BY_A_BOUND)
+@pytest.mark.parametrize("off", [0.0, 1.0])
+def test_a_search_comes_back_from_a_bound_that_hides_the_minimum(name, off):
+    """From where the value is e⁻³⁰ from its bound, and its coordinate changes nothing, also with the other number
+    off. The truth is seven standard errors from the bound."""
+    parameter, bound, side = BY_A_BOUND[name]
+    truth = np.array([bound + side * 7 * ERROR, 0.3])
+    y = LINE @ truth + np.random.default_rng(3).normal(size=STEPS)
+    start = np.array([-30.0 * side, off])
+    found = search(Line(parameter, y), mpm.fitting.LevenbergMarquardt(), start, (jnp.ones(()),))
+    assert found.converged
+    values = np.asarray(Line(parameter, y).numbers(found.z))
+    assert values == pytest.approx(np.linalg.lstsq(LINE, y)[0], abs=1e-3 * ERROR)
 
 
 @pytest.mark.parametrize("name", BY_A_BOUND)

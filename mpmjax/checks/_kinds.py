@@ -53,7 +53,11 @@ def checked(function: Function) -> Function:
 
     @wraps(function)
     def guarded(*args: Any, **kwargs: Any) -> Any:
-        for name, argument in signature.bind(*args, **kwargs).arguments.items():
+        try:
+            arguments = signature.bind(*args, **kwargs).arguments
+        except TypeError as error:  # which names no function
+            raise TypeError(f"{owner} takes {', '.join(signature.parameters)}: {error}.") from None
+        for name, argument in arguments.items():
             several = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
             for value in argument if several else (argument,) if name in hints else ():
                 require_kind(f"{owner}'s {name}", value, hints[name])

@@ -25,10 +25,9 @@ class LevenbergMarquardt(AbstractOptimiser):
     grows fourfold where one does not lower it by a hundredth of that, or a simulation fails: that one is not taken. It
     is larger where a number with a bound would move by more than 2 in its coordinate, a modulus sevenfold, or a quarter
     of that for each refusal before: so far no straight line knows the way. From the second refusal on the next step is
-    a quarter of the refused one at most.
-
-    Near a bound the coordinate hides the value from it: the damping then holds a step that the data ask for. There the
-    next one is the Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds.
+    a quarter of the refused one at most, and half of one that brought less than a quarter of what was foretold. Near a
+    bound, which hides the value from its coordinate, damping holds a step that the data ask for: there the next one is
+    the Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds.
 
     It ends where a step changes nothing by more than the tolerance, where the next Gauss-Newton step, no longer than to
     a bound, is less than a ten-thousandth of the standard error that the misfit gives, or where one is refused and
@@ -67,13 +66,14 @@ class LevenbergMarquardt(AbstractOptimiser):
         reach, refused, longest, settled, stalled = float(state.reach), 0, np.inf, False, False
         if before.history:
             last, tried, moved = _Lines.at(before.seen), _Lines.at(seen), np.asarray(z - before.z, float)
-            growth = _growth(last, tried, moved)
-            reach *= growth
-            if growth >= 1:
+            gain = _gain(last, tried, moved)
+            if gain >= _LEAST_GAIN:
+                reach *= _LONGER if gain > _GOOD_GAIN else 1
+                longest = np.abs(moved).max() / 2 if gain < _POOR_GAIN else np.inf
                 changes, sizes = np.append(moved, tried.r - last.r), np.abs(np.append(z, tried.r))
                 settled = bool((np.abs(changes) < float(self.rtol) * (1 + sizes)).all())
             else:
-                z, seen, refused = before.z, before.seen, int(state.refused) + 1
+                z, seen, refused, reach = before.z, before.seen, int(state.refused) + 1, reach / _SHORTER
                 longest = np.abs(moved).max() / _SHORTER if refused > 1 else np.inf
             stalled = _leads_nowhere(before, z, last, min(tried.square, last.square))
         lines = _Lines.at(seen)
@@ -81,12 +81,13 @@ class LevenbergMarquardt(AbstractOptimiser):
             return z, state, seen
         bent = np.isfinite(lines.room).any(axis=0)  # coordinates of numbers with a bound
         step = _damped(lines, reach, np.minimum(np.where(bent, _FURTHEST / _SHORTER**refused, np.inf), longest))
-        wanted = np.abs(np.linalg.lstsq(lines.J, -lines.r)[0]).max()
+        newton, limited = lines.gauss_newton()
+        wanted = np.abs(newton[~limited]).max(initial=0)
         held = wanted > _FAR * float(self.rtol) and (stalled or np.abs(step).max() < _REFUSED * wanted)
         over = settled or stalled
-        if not refused and (straight := _to_a_bound(lines, step)) is not None:
-            # If it is refused, damped steps go on as if it had not been tried.
-            step, reach = straight, reach * _SHORTER
+        straight = _beside_a_bound(lines, newton / _SHORTER**refused, step, not refused and np.isinf(longest))
+        if straight is not None:
+            step, reach = straight, reach * _SHORTER  # if it is refused, damping is as if it had not been tried
         after = np.asarray(z, float) + step, reach, refused, over and not held, over and held
         return z, DampedState(*(jnp.asarray(a, leaf.dtype) for a, leaf in zip(after, state, strict=True))), seen
 
@@ -163,13 +164,11 @@ class _Lines(NamedTuple):
         return step / length, np.asarray((step <= -down) | (step >= up))
 
 
-def _growth(last: _Lines, tried: _Lines, moved: np.ndarray) -> float:
-    """The factor of the reach after a step, by its part of the foretold decrease; below one the step is refused."""
+def _gain(last: _Lines, tried: _Lines, moved: np.ndarray) -> float:
+    """The part of the foretold decrease that a step brought, NaN where the simulation failed."""
     # Near a bound the quadratic, of coordinates, may foretell a step uphill: none is taken.
-    foretold, change = min(last.after(moved) - last.square, 0.0), tried.square - last.square
-    if not change <= _LEAST_RATIO * foretold:
-        return 1 / _SHORTER
-    return _LONGER if change < _GOOD_RATIO * foretold < 0 else 1.0
+    foretold, change = last.after(moved) - last.square, tried.square - last.square
+    return change / foretold if foretold < 0 else _POOR_GAIN if change <= 0 else np.nan
 
 
 def _leads_nowhere(before: Search, z: Coordinates, last: _Lines, lowest: float) -> bool:
@@ -191,20 +190,21 @@ def _damped(lines: _Lines, reach: float, furthest: np.ndarray) -> np.ndarray:
     return steps[:, short.argmax() if short.any() else -1]
 
 
-def _to_a_bound(lines: _Lines, damped: np.ndarray) -> np.ndarray | None:
-    """The Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds, where damping
-    holds one beside a bound; else None."""
-    step = lines.gauss_newton()[0]
+def _beside_a_bound(lines: _Lines, step: np.ndarray, damped: np.ndarray, surely: bool) -> np.ndarray | None:
+    """A Gauss-Newton step with straight lines of values beside bounds, where damping holds one that leaves a bound,
+    hidden by it, or, if it is sure, any where Σ r² has come to noise; else None."""
     left = lines.after(step)
-    limit = _HIDDEN**2 * left / max(lines.freedom, 1)  # of Δχ², by which chance puts a minimum beyond a bound
-    if not (lines.freedom > 0 and lines.square - left <= limit * len(step)):
-        return None  # there is no step, or Σ r² is no noise yet, and says nothing of errors
+    limit = _NEAR**2 * left / max(lines.freedom, 1)  # of Δχ², by which chance puts a minimum beyond a bound
     (down, up), square = lines.room, np.maximum((lines.J**2).sum(axis=0), np.finfo(float).tiny)
     near = square * np.minimum(down, up) ** 2 <= limit
-    side = np.where(down < up, 1, -1)
-    straight = side * np.minimum(np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1)), _LEAP)
+    least = np.exp(-_LEAP) - 1
+    straight = np.log1p(np.maximum(step / down, least)) - np.log1p(np.maximum(-step / up, least))
     wanted = np.where(near, straight, step)
-    return wanted if (near & (np.abs(damped) < np.abs(wanted) / 2)).any() else None
+    held = (near & (np.abs(damped) < np.abs(wanted) / 2)).any() and lines.freedom > 0
+    hidden = (near & np.where(step > 0, up > _HIDDEN * down, down > _HIDDEN * up)).any()
+    leaves = hidden and (np.abs(step[~near]) <= _FURTHEST).all()
+    noise = surely and lines.square - left <= limit * len(step)
+    return wanted if held and (leaves or noise) else None
 
 
 class LBFGS(AbstractOptimiser):
@@ -405,7 +405,7 @@ def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-_LEAST_RATIO, _GOOD_RATIO = 0.01, 0.99  # parts of the foretold decrease from which a step is taken, and reach grows
+_LEAST_GAIN, _POOR_GAIN, _GOOD_GAIN = 0.01, 0.25, 0.99  # from which one step is taken, the next as long, reach grows
 _LONGER, _SHORTER = 3.5, 4.0  # factors of the reach where a step was as foretold, and where it is refused
 _REACHES = 1e-300, 1e300
 _FAR = 100.0  # a step is short below so many tolerances
@@ -415,6 +415,6 @@ _NOWHERE, _SLOW = 0.03, 0.1  # how far they move a coordinate [-], by what part 
 _LITTLE = 0.01  # part of the variance by which a step of a tenth of a standard error lowers Σ r²
 _FURTHEST = 2.0  # longest step of a coordinate with a bound [-]
 _LEAP = 9.0  # longest step to a bound [-]: to a ten-thousandth of the distance from it
-_HIDDEN = 3.0  # standard errors from a bound within which a coordinate is near it
+_NEAR, _HIDDEN = 3.0, 20.0  # errors from a bound that are near it; how many times farther the other is if it hides
 _NEGLIGIBLE = 1e-4  # a step of so many standard errors is none
 _ROUNDINGS = 10  # rounding of Σ r², in ε: a smaller change of it cannot be told
