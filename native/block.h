@@ -66,35 +66,13 @@ MPMJAX_INLINE void write(const T* from, int count, T* to) {
   prefetch_block<true>(to);
 }
 
-// Two vectors' lanes in turn, so many of each at a time: of their first halves, or of their second ones.
-template <int together, int half, int lanes, int... lane>
-constexpr auto in_turn(std::integer_sequence<int, lane...>) {
-  return std::integer_sequence<int, (half * lanes / 2 + lane / (2 * together) * together + lane % together +
-                                     lane / together % 2 * lanes)...>();
-}
-template <class T, int together, int half>
-MPMJAX_INLINE Simd<T> zipped(Simd<T> a, Simd<T> b) {
-  constexpr int lanes = kSimdLanes<T>;
-  return shuffled(a, b, LanesOf<T, lanes>(), in_turn<together, half, lanes>(Count<lanes>()));
-}
-
-// Four columns of a vector of particles as rows, one for each.
-template <class T>
-MPMJAX_INLINE void to_rows(const Simd<T>* columns, Vector<T>* rows) {
-  const Simd<T> pairs[] = {zipped<T, 1, 0>(columns[0], columns[1]), zipped<T, 1, 0>(columns[2], columns[3]),
-                           zipped<T, 1, 1>(columns[0], columns[1]), zipped<T, 1, 1>(columns[2], columns[3])};
-  const Simd<T> fours[] = {zipped<T, 2, 0>(pairs[0], pairs[1]), zipped<T, 2, 1>(pairs[0], pairs[1]),
-                           zipped<T, 2, 0>(pairs[2], pairs[3]), zipped<T, 2, 1>(pairs[2], pairs[3])};
-  std::memcpy(rows, fours, sizeof fours);
-}
-
-// The same of a block's columns, and zeros in those that there are not.
+// A block's columns as rows of four, with zeros in those that there are not.
 template <class T, int columns>
 MPMJAX_INLINE void to_rows(const T (*from)[kBlock], Vector<T>* rows) {
   for (int q = 0; q < kBlock; q += kSimdLanes<T>) {
     Simd<T> read[kLanes] = {};
     for (int c = 0; c < columns; ++c) read[c] = load_as<Simd<T>>(from[c] + q);
-    to_rows<T>(read, rows + q);
+    to_rows(read, rows + q);
   }
 }
 

@@ -1,120 +1,199 @@
-// The sums that XLA calls, read from its buffers and run on what a back end has: a pool of threads, or a stream of a GPU.
+// A problem read from a call by XLA and run on what a back end has: a pool of threads, or a stream of a GPU.
 //
-// Operands and results are the arrays that a problem lists, with the same leading axes everywhere. Particles give a
-// value or gradients or both, and gradients may have fewer columns than the value. A pull returns the gather or not; an
-// average returns memory that it worked in. Attributes of a sum are the basis, whether there is a value, `valued`, and
-// whether there is dt, `differential`.
+// Operands and results are the arrays that the problem lists, with the same leading axes everywhere. Their shapes set
+// its sizes, and are checked against each other, so that nothing is read or written beyond them. The attribute `present`
+// says of each operand whether it is there; optional results come in order until the last one that there is. A sum has
+// its basis as attributes, a rearrangement `inverse`.
 
 #pragma once
 
-#include "call.h"
+#include <algorithm>
+#include <string>
+#include <type_traits>
+#include <vector>
+
+#include "problems.h"
+#include "xla/ffi/api/ffi.h"
+
+// The sums that all back ends have: calls f(name of the handler, problem).
+#define MPMJAX_SUMS(f) f(gather, Gather) f(scatter, Scatter) f(average, Average) f(pull, Pull) f(resist, Resist)
+
+namespace ffi = xla::ffi;
 
 namespace mpmjax {
 namespace {
 
-// The sizes and polynomials of a sum's stencils.
+template <class X>
+constexpr ffi::DataType type_of() {
+  if constexpr (std::is_same_v<X, bool>) return ffi::DataType::PRED;
+  if constexpr (std::is_same_v<X, int32_t>) return ffi::DataType::S32;
+  return std::is_same_v<X, float> ? ffi::DataType::F32 : ffi::DataType::F64;
+}
+
+// A call's buffers, operands and then results, with its attributes. The leading axes are those of the first operand
+// before the ones that the problem lists.
+struct Call {
+  std::vector<ffi::AnyBuffer> buffers;
+  size_t operands = 0;
+  ffi::Dictionary attributes;
+  std::vector<int64_t> leading;
+  int64_t batch = 1;
+  std::string fault;
+
+  Call(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results, const ffi::Dictionary& attributes)
+      : operands(arguments.size()), attributes(attributes) {
+    for (size_t i = 0; i < operands; ++i) buffers.push_back(arguments.get<ffi::AnyBuffer>(i).value());
+    for (size_t i = 0; i < results.size(); ++i) buffers.push_back(*results.get<ffi::AnyBuffer>(i).value());
+  }
+
+  void expect(bool holds, const char* what) {
+    if (!holds && fault.empty()) fault = what;
+  }
+
+  ffi::Error outcome() const {
+    if (fault.empty()) return ffi::Error::Success();
+    return ffi::Error::InvalidArgument("mpmjax's native sums: " + fault + ". This is a fault of mpmjax.");
+  }
+
+  template <class To>
+  void take(const char* name, To& to) {
+    const auto value = attributes.get<To>(name);
+    expect(value.has_value(), "an attribute is missing");
+    if (value.has_value()) to = *value;
+  }
+
+  // Points a problem at the buffers, and sets its sizes.
+  template <class Problem>
+  void read(Problem& problem) {
+    const auto mask = attributes.get<ffi::Span<const int64_t>>("present");
+    const ffi::Span<const int64_t> present = mask.has_value() ? *mask : ffi::Span<const int64_t>();
+    std::vector<const int64_t*> set;
+    size_t listed = 0, k = 0;
+    problem.arrays([&](auto& array, Lengths lengths, bool optional = false) {
+      using Element = std::remove_pointer_t<std::remove_reference_t<decltype(array)>>;
+      constexpr bool is_operand = std::is_const_v<Element>;
+      const size_t i = listed++;
+      const bool there = is_operand ? (i < present.size() ? present[i] != 0 : !optional) : !optional || k < buffers.size();
+      expect(there || optional, "an operand is missing");
+      if (!there || !fault.empty()) return;
+      expect(is_operand ? k < operands : k >= operands && k < buffers.size(), "too many or too few arrays");
+      if (!fault.empty()) return;
+      const ffi::AnyBuffer& buffer = buffers[k];
+      const auto shape = buffer.dimensions();
+      if (k == 0 && shape.size() >= lengths.size()) leading.assign(shape.begin(), shape.end() - lengths.size());
+      expect(buffer.element_type() == type_of<std::remove_const_t<Element>>(), "arrays of another type or precision");
+      bool fits = shape.size() == leading.size() + lengths.size() &&
+                  std::equal(leading.begin(), leading.end(), shape.begin());
+      for (size_t a = 0; fits && a < lengths.size(); ++a) {
+        const Length& n = lengths.begin()[a];
+        const int64_t found = shape[leading.size() + a];
+        const bool is_set = n.size == nullptr || std::find(set.begin(), set.end(), n.size) != set.end();
+        fits = !is_set || found == (n.size == nullptr ? n.value : *n.size);
+        if (!is_set) *n.size = found, set.push_back(n.size);
+      }
+      expect(fits, "arrays whose shapes do not fit each other");
+      array = static_cast<Element*>(buffer.untyped_data());
+      ++k;
+    });
+    expect(k == buffers.size(), "too many or too few arrays");
+    for (const int64_t n : leading) batch *= n;
+  }
+};
+
+// How nodes are numbered, and the polynomials.
 template <class T>
-void take_stencils(Call& call, Stencils<T>& stencils) {
+void take_basis(Call& call, Basis<T>& basis) {
   ffi::Span<const int64_t> shape, periodic;
   ffi::Span<const double> knots, weights, slopes;
   call.take("shape", shape), call.take("periodic", periodic);
   call.take("knots", knots), call.take("weights", weights), call.take("slopes", slopes);
-  const int64_t d = call.dim(0, 2), s = static_cast<int64_t>(knots.size());
-  const int64_t terms = s > 0 ? static_cast<int64_t>(weights.size()) / s : 0;
-  call.expect(d >= 1 && d <= kMostAxes, "no dimension of one to three");
-  call.expect(int64_t(shape.size()) == d && int64_t(periodic.size()) == d, "no number of nodes for each axis");
+  const size_t d = shape.size(), s = knots.size(), terms = s > 0 ? weights.size() / s : 0;
+  call.expect(d >= 1 && d <= kMostAxes && periodic.size() == d, "no number of nodes for each of one to three axes");
   call.expect(s >= 2 && s <= kMostNodes, "there is no kernel of this order");
-  call.expect(int64_t(weights.size()) == terms * s && terms <= kMostTerms && slopes.size() == weights.size(),
+  call.expect(weights.size() == terms * s && terms <= kMostTerms && slopes.size() == weights.size(),
               "no coefficients (s, terms) of both families");
   for (const int64_t n : shape) call.expect(n > 0 && n <= INT32_MAX, "axes without nodes");
   if (!call.fault.empty()) return;
-  stencils.particles = call.dim(0, 1);
-  Basis<T>& basis = stencils.basis;
   basis.d = static_cast<int>(d), basis.s = static_cast<int>(s), basis.terms = static_cast<int>(terms);
-  for (int64_t a = d - 1, stride = 1; a >= 0; stride *= shape[a--]) {
+  int64_t stride = 1;
+  for (size_t a = d; a-- > 0; stride *= shape[a]) {
     basis.shape[a] = static_cast<int32_t>(shape[a]), basis.strides[a] = static_cast<int32_t>(stride);
     basis.periodic[a] = periodic[a] != 0;
   }
-  for (int64_t i = 0; i < s; ++i) {
+  for (size_t i = 0; i < s; ++i) {
     basis.knots[i] = static_cast<T>(knots[i]);
-    for (int64_t k = 0; k < terms; ++k) {
+    for (size_t k = 0; k < terms; ++k) {
       basis.weights[i][k] = static_cast<T>(weights[i * terms + k]);
       basis.slopes[i][k] = static_cast<T>(slopes[i * terms + k]);
     }
   }
 }
 
-// A sum whose k-th array is that of the nodes.
+// What a problem has besides arrays.
+template <class Problem, class = void>
+constexpr bool kHasBasis = false;
 template <class Problem>
-Problem sum_of(Call& call, size_t k) {
+constexpr bool kHasBasis<Problem, std::void_t<decltype(Problem::stencils)>> = true;
+
+template <class Problem>
+void take_attributes(Call& call, Problem& task) {
+  if constexpr (kHasBasis<Problem>) take_basis(call, task.stencils.basis);
+}
+template <class T>
+void take_attributes(Call& call, Rearrangement<T>& task) {
+  call.take("inverse", task.inverse);
+}
+
+// Whether sizes go together, beyond what the shapes that are listed say.
+template <class Problem>
+bool fits(const Problem&) { return true; }
+template <class Problem>
+bool has_nodes(const Problem& all) { return all.size > 0 || all.stencils.particles == 0; }
+template <class T>
+bool fits(const Gather<T>& all) { return has_nodes(all); }
+template <class T>
+bool fits(const Scatter<T>& all) { return all.values.graded <= all.columns; }
+template <class T>
+bool fits(const Average<T>& all) { return all.values.graded <= all.columns; }
+template <class T>
+bool fits(const Pull<T>& all) {
+  return has_nodes(all) && all.values.graded <= all.columns && (all.value == nullptr) == (all.gradients == nullptr);
+}
+template <class T>
+bool fits(const Resist<T>& all) { return has_nodes(all) && all.columns == all.stencils.basis.d; }
+template <class T>
+bool fits(const P2G<T>& all) { return all.columns == all.stencils.basis.d + 1; }
+template <class T>
+bool fits(const G2P<T>& all) {
+  return has_nodes(all) && all.columns == all.stencils.basis.d && (all.F == nullptr) == (all.strained == nullptr);
+}
+template <class T>
+bool fits(const Solve<T>& all) {
+  const int64_t numbers = kVectors * all.nodes * all.stencils.basis.d;
+  return (all.nodes > 0 || all.stencils.particles == 0) && (all.room == 0 || all.room == numbers);
+}
+template <class T>
+bool fits(const Product<T>& all) { return all.nodes > 0 ? all.size % all.nodes == 0 : all.size == 0; }
+
+// Reads a problem and runs it. One in double is taken where the first array of numbers is.
+template <class Problem, class On>
+void run_as(const On& on, Call& call) {
   Problem task = {};
-  take_stencils(call, task.stencils);
-  task.size = call.dim(k, 2), task.columns = call.dim(k, 1);
-  call.expect(task.size > 0 || task.stencils.particles == 0 || k >= call.operands, "no nodes to gather from");
-  return task;
+  take_attributes(call, task);
+  if (call.fault.empty()) call.read(task);
+  call.expect(!call.fault.empty() || fits(task), "arrays whose sizes do not go together");
+  if (call.fault.empty()) run(on, call.batch, task);
 }
-
-// Whether gradients are given, of operands that end with a value, if there is one, from the k-th on.
-template <class Problem>
-bool take_graded(Call& call, Problem& task, size_t k, bool valued) {
-  const bool graded = call.operands > k + valued;
-  if (graded) task.values.graded = call.dim(k + valued, 2);
-  call.expect(task.values.graded <= task.columns, "more columns of gradients than of nodes");
-  return graded;
-}
-
-template <class T, class On = Pool>
-void call_gather(const On& on, Call& call) {
-  const bool moved = call.flag("differential");
-  auto task = sum_of<Gather<T>>(call, 2 + moved);
-  if (call.read(task, 3 + moved, 2, {true, true, moved})) gather(on, call.batch, task);
-}
-
-template <class T, class On = Pool>
-void call_scatter(const On& on, Call& call) {
-  const bool moved = call.flag("differential"), valued = call.flag("valued");
-  auto task = sum_of<Scatter<T>>(call, call.operands);
-  const bool graded = take_graded(call, task, 2 + moved, valued);
-  const size_t operands = 2 + moved + valued + graded;
-  if (call.read(task, operands, 1, {true, true, moved, valued, graded})) scatter(on, call.batch, task);
-}
-
-template <class T, class On = Pool>
-void call_average(const On& on, Call& call) {
-  auto task = sum_of<Average<T>>(call, call.operands + 2);
-  const bool graded = take_graded(call, task, 3, true);
-  if (call.read(task, 4 + graded, 3, {true, true, false, true, true, graded})) average(on, call.batch, task);
-}
-
-template <class T, class On = Pool>
-void call_pull(const On& on, Call& call) {
-  const bool valued = call.flag("valued"), gathers = call.buffers.size() > call.operands + 1;
-  auto task = sum_of<Pull<T>>(call, 2);
-  const bool graded = take_graded(call, task, 3, valued);
-  const size_t operands = 3 + valued + graded, results = gathers ? 3 : 1;
-  if (call.read(task, operands, results, {true, true, false, true, valued, graded})) pull(on, call.batch, task);
-}
-
-template <class T, class On = Pool>
-void call_resist(const On& on, Call& call) {
-  auto task = sum_of<Resist<T>>(call, 3);
-  call.expect(task.columns == task.stencils.basis.d, "a displacement of another dimension");
-  if (call.read(task, 4, 1, {true, true, false})) resist(on, call.batch, task);
-}
-
-// Runs what is for floats or for doubles, as the operand `like` says. The first operand has so many trailing axes.
-template <auto for_floats, auto for_doubles, size_t trailing, size_t like, class On>
-ffi::Error run_on(const On& on, ffi::Dictionary attributes, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
-  Call call(arguments, results, attributes, trailing);
-  if (!call.fault.empty()) return call.outcome();
-  const ffi::DataType type = like < call.buffers.size() ? call.buffers[like].element_type() : ffi::DataType::INVALID;
-  if (type == ffi::DataType::F32 || for_floats == for_doubles) {
-    for_floats(on, call);
-  } else if (type == ffi::DataType::F64) {
-    for_doubles(on, call);
-  } else {
-    call.expect(false, "there is no kernel of this type");
-  }
+template <class InFloats, class InDoubles, class On>
+ffi::Error run_call(const On& on, ffi::Dictionary attributes, ffi::RemainingArgs arguments,
+                    ffi::RemainingRets results) {
+  Call call(arguments, results, attributes);
+  const auto is_float = [](const ffi::AnyBuffer& buffer) {
+    return buffer.element_type() == ffi::DataType::F32 || buffer.element_type() == ffi::DataType::F64;
+  };
+  const auto numbers = std::find_if(call.buffers.begin(), call.buffers.end(), is_float);
+  const bool doubles = numbers != call.buffers.end() && numbers->element_type() == ffi::DataType::F64;
+  doubles ? run_as<InDoubles>(on, call) : run_as<InFloats>(on, call);
   return call.outcome();
 }
 

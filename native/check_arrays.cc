@@ -1,214 +1,239 @@
-// Checks the passes over arrays: vectors of a solve, decompositions of matrices, and the order of numbers.
+// Checks the passes over arrays: vectors of a solve, solves, decompositions of matrices, and the order of numbers.
 
+#include <array>
 #include <numeric>
 
 #include "check.h"
 #include "kernels.h"
+#include "solve.h"
 
 namespace mpmjax {
 namespace {
 
-// Vectors of which some blocks are zero, combined in place and elsewhere; whatever is passed over stays or becomes
-// zero.
-template <class T>
-void check_vectors(int64_t size, bool in_place, std::mt19937& random, const std::vector<const Pool*>& pools) {
-  const int64_t batch = 2, blocks = blocks_of(size);
-  const Array<T> a(batch * size), b(a.size), c(a.size), d(a.size), weight(a.size), scales(2 * batch), sum(batch);
-  const Array<bool> active(batch * blocks);
-  for (int64_t i = 0; i < active.size; ++i) active[i] = random() % 3 == 0;
-  for (const Array<T>* array : {&a, &b, &c, &d, &weight, &scales}) array->draw(random);
-  for (int64_t i = 0; i < a.size; ++i) {
-    if (!active[i / size * blocks + i % size / kChunk]) a[i] = b[i] = c[i] = d[i] = 0;
+constexpr int64_t kBatch = 2;
+
+// Numbers of blocks that are not active become zero, or another number.
+template <class X>
+void clear_inactive(const X* numbers, const bool* active, int64_t size, X other = 0) {
+  for (int64_t i = 0; i < kBatch * size; ++i) {
+    if (!active[i / size * blocks_of(size) + i % size / kChunk]) changed(numbers)[i] = other;
   }
-  Expected y(a.size, 30), z(a.size, 30), total(batch, 1);
-  for (int64_t i = 0; i < a.size; ++i) {
-    y.value[i] = a[i] + double(scales[i / size * 2]) * b[i];
-    z.value[i] = c[i] + double(scales[i / size * 2 + 1]) * d[i];
-    const double square = weight[i] * z.value[i] * z.value[i];
-    total.add(i / size, square, std::abs(square));
-  }
-  const Array<T> to_y(a.size), to_z(a.size);
-  const T *from_b = in_place ? to_y.get() : b.get(), *from_d = in_place ? to_z.get() : d.get();
-  by_all(pools, "combinations", [&](const Pool& pool) {
-    to_y.fill(7), to_z.fill(7);
-    if (in_place) copy(b, to_y), copy(d, to_z);
-    combine(pool, batch, Combine<T>{a.get(), from_b, c.get(), from_d, scales.get(), weight.get(), active.get(),
-                                    to_y.get(), to_z.get(), sum.get(), size});
-  }, to_y, to_z, sum);
-  const Shape shape = {1, 0, batch, size, 0, 0};
-  compare("combine y", shape, to_y, y);
-  compare("combine z", shape, to_z, z);
-  compare("combine sum", shape, sum, total);
 }
 
-// What is left of a product, in place; nothing is free and all is zero where blocks are passed over.
+// Combinations of vectors of which some blocks are zero, in place and elsewhere: what is passed over stays or becomes
+// zero.
 template <class T>
-void check_product(int64_t nodes, int64_t each, std::mt19937& random, const std::vector<const Pool*>& pools) {
-  const int64_t batch = 2, size = nodes * each, blocks = blocks_of(size);
-  const Array<T> force(batch * size), v(force.size), weight(force.size), mass(batch * nodes), factor(batch), sum(batch);
-  const Array<T> to(force.size);
-  const Array<bool> active(batch * blocks), free(force.size);
-  for (int64_t i = 0; i < active.size; ++i) active[i] = random() % 3 == 0;
-  for (const Array<T>* array : {&force, &v, &weight, &mass, &factor}) array->draw(random);
-  Expected image(force.size, 1), total(batch, 1);
-  for (int64_t i = 0; i < force.size; ++i) {
+void check_combinations(int64_t size, bool in_place, const Pools& pools) {
+  Random random(1);
+  Combine<T> sizes = {};
+  sizes.size = size;
+  Example<Combine<T>> e(sizes, kBatch, random);
+  Combine<T>& task = e.task;
+  for (const T* vector : {task.a, task.b, task.c, task.d}) clear_inactive(vector, task.active, size);
+  std::vector<double> y(kBatch * size), z(y), sum(kBatch);
+  for (int64_t i = 0; i < kBatch * size; ++i) {
     const int64_t m = i / size;
-    weight[i] = 1 + std::abs(weight[i]);
-    if (!active[m * blocks + i % size / kChunk]) { v[i] = 0; continue; }
-    free[i] = random() % 3 > 0;
-    const double held = mass[m * nodes + i % size / each] * v[i], pushed = double(factor[m]) * force[i];
-    const double of_a = free[i] ? held + pushed : double(v[i]);
-    image.add(i, of_a / weight[i], std::abs(held) + std::abs(pushed));
-    total.add(m, of_a * v[i], image.scale[i] * std::abs(v[i]));
+    y[i] = task.a[i] + double(task.scales[2 * m]) * task.b[i];
+    z[i] = task.c[i] + double(task.scales[2 * m + 1]) * task.d[i];
+    sum[m] += task.weight[i] * z[i] * z[i];
   }
-  by_all(pools, "products", [&](const Pool& pool) {
-    copy(force, to);
-    product(pool, batch, Product<T>{to.get(), v.get(), mass.get(), factor.get(), free.get(), weight.get(), active.get(),
-                                    to.get(), sum.get(), size, nodes, true});
-  }, to, sum);
-  const Shape shape = {1, 0, batch, size, 0, 0};
-  compare("product", shape, to, image);
-  compare("product's sum", shape, sum, total);
+  if (in_place) task.y = changed(task.b), task.z = changed(task.d);
+  e.run_by_all(pools, "combine");
+  compare("y", task.y, y.data(), y.size(), 10);
+  compare("z", task.z, z.data(), z.size(), 10);
+  compare("a combination's sum", task.sum, sum.data(), kBatch, 1000);
+}
+
+// What is left of a product, in place.
+template <class T>
+void check_products(int64_t nodes, int64_t each, const Pools& pools) {
+  Random random(1);
+  Product<T> sizes = {};
+  sizes.nodes = nodes, sizes.size = nodes * each;
+  Example<Product<T>> e(sizes, kBatch, random);
+  Product<T>& task = e.task;
+  clear_inactive(task.v, task.active, task.size), clear_inactive(task.free, task.active, task.size);
+  std::vector<double> image(kBatch * task.size), sum(kBatch);
+  for (int64_t i = 0; i < kBatch * task.size; ++i) {
+    const int64_t m = i / task.size;
+    const double v = task.v[i], held = task.mass[m * nodes + i % task.size / each] * v;
+    const double of_a = task.free[i] ? held + double(task.factor[m]) * task.force[i] : v;
+    changed(task.weight)[i] = 1 + std::abs(task.weight[i]);
+    image[i] = of_a / task.weight[i], sum[m] += of_a * v;
+  }
+  clear_inactive(image.data(), task.active, task.size);
+  task.image = changed(task.force);
+  e.run_by_all(pools, "product");
+  compare("a product", task.image, image.data(), image.size(), 10);
+  compare("a product's sum", task.sum, sum.data(), kBatch, 1000);
+}
+
+using Matrix = std::array<double, 9>;
+
+Matrix transposed(const Matrix& a) { return {a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8]}; }
+
+Matrix operator*(const Matrix& a, const Matrix& b) {
+  Matrix c = {};
+  for (int i = 0; i < 27; ++i) c[i / 9 * 3 + i % 3] += a[i / 9 * 3 + i / 3 % 3] * b[i / 3 % 3 * 3 + i % 3];
+  return c;
 }
 
 // A = V diag(w) Vᵀ and F = R S of random matrices, of all magnitudes, with repeated eigenvalues, of zeros alone. V and
 // R are rotations, and S is symmetric. What is not finite spoils its own particle alone.
 template <class T>
-void check_matrices(int64_t particles, std::mt19937& random, const std::vector<const Pool*>& pools) {
-  const int64_t batch = 2, n = particles;
-  const Array<T> matrices(batch * 9 * n), values(batch * 3 * n), vectors(matrices.size), rotations(matrices.size);
-  std::normal_distribution<T> normal;
-  for (int64_t m = 0; m < batch; ++m) {
-    for (int64_t k = 0; k < n; ++k) {
-      const T size = k % 7 == 6 ? 0 : std::pow(T(10), T(3 * (k % 7 - 3)));
-      for (int i = 0; i < 9; ++i) {
-        const T repeated = i % 4 == 0 ? 1 : 0;
-        matrices[(9 * m + i) * n + k] = size * (k % 3 == 0 ? repeated : normal(random));
-      }
-      if (k % 11 == 10) matrices[9 * m * n + k] = std::numeric_limits<T>::quiet_NaN();
+void check_matrices(int64_t particles, const Pools& pools) {
+  Random random(1);
+  Eigen<T> eigen_sizes = {};
+  Rotation<T> rotation_sizes = {};
+  eigen_sizes.particles = rotation_sizes.particles = particles;
+  const Example<Eigen<T>> eigen(eigen_sizes, kBatch, random);
+  const Example<Rotation<T>> rotation(rotation_sizes, kBatch, random);
+  const T* matrices = rotation.task.matrices;
+  for (int64_t i = 0; i < kBatch * 9 * particles; ++i) {
+    const int64_t k = i % particles, component = i / particles % 9;
+    const T size = k % 7 == 6 ? 0 : std::pow(T(10), T(3 * (k % 7 - 3)));
+    if (k % 3 == 0) changed(matrices)[i] = component % 4 == 0;
+    changed(matrices)[i] = k % 11 == 10 && component == 0 ? NAN : size * matrices[i];
+    changed(eigen.task.matrices)[i] = matrices[i];
+  }
+  eigen.run_by_all(pools, "eigen"), rotation.run_by_all(pools, "rotation");
+  for (int64_t i = 0; i < kBatch * particles; ++i) {
+    const auto at = [&](const T* from, int rows, int row) {
+      return double(from[(i / particles * rows + row) * particles + i % particles]);
+    };
+    Matrix F, V, R, w = {};
+    for (int k = 0; k < 9; ++k) {
+      F[k] = at(matrices, 9, k), V[k] = at(eigen.task.vectors, 9, k), R[k] = at(rotation.task.rotations, 9, k);
+      if (k % 4 == 0) w[k] = at(eigen.task.values, 3, k / 4);
     }
-  }
-  const Shape shape = {3, 0, batch, n, 0, 0};
-  by_all(pools, "decompositions", [&](const Pool& pool) {
-    eigen(pool, batch, Eigen<T>{matrices.get(), values.get(), vectors.get(), n});
-    rotation(pool, batch, Rotation<T>{matrices.get(), rotations.get(), n});
-  }, values, vectors, rotations);
-  // Of what is found: V diag(w) Vᵀ, VᵀV, RᵀR, and RᵀF beside its transpose.
-  const Array<T> product(matrices.size), squares(2 * matrices.size), stretch(matrices.size);
-  Expected A(matrices.size), one(squares.size, 1), transposed(matrices.size);
-  for (int64_t m = 0; m < batch; ++m) {
-    for (int64_t k = 0; k < n; ++k) {
-      const auto at = [&](int i, int j) { return (9 * m + 3 * i + j) * n + k; };
-      double size = 0;
-      for (int i = 0; i < 9; ++i) size += std::abs(matrices[at(0, i)]);
-      for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j < 3; ++j) {
-          double a = 0, v = 0, r = 0, s = 0, t = 0;
-          for (int l = 0; l < 3; ++l) {
-            a += double(vectors[at(i, l)]) * values[(3 * m + l) * n + k] * vectors[at(j, l)];
-            v += double(vectors[at(l, i)]) * vectors[at(l, j)];
-            r += double(rotations[at(l, i)]) * rotations[at(l, j)];
-            s += double(rotations[at(l, i)]) * matrices[at(l, j)];
-            t += double(rotations[at(l, j)]) * matrices[at(l, i)];
-          }
-          product[at(i, j)] = T(a), A.add(at(i, j), matrices[i < j ? at(i, j) : at(j, i)], size);
-          squares[at(i, j)] = T(v), squares[matrices.size + at(i, j)] = T(r);
-          one.value[at(i, j)] = one.value[matrices.size + at(i, j)] = std::isfinite(size) ? i == j : size;
-          stretch[at(i, j)] = T(s), transposed.add(at(i, j), t, size);
-          if (!std::isfinite(size)) A.value[at(i, j)] = size, squares[at(i, j)] = T(size);  // V may be the identity
-        }
-      }
+    if (std::isnan(F[0])) {
+      expect(std::isnan(w[0]) && std::isnan(R[0]), "a matrix that is not finite");
+      continue;
     }
+    const Matrix A = {F[0], F[1], F[2], F[1], F[4], F[5], F[2], F[5], F[8]}, one = {1, 0, 0, 0, 1, 0, 0, 0, 1};
+    const Matrix S = transposed(R) * F;
+    const double roundings = 64 * std::numeric_limits<T>::epsilon() / std::numeric_limits<double>::epsilon();
+    const auto agree = [&](const char* what, const Matrix& result, const Matrix& expected) {
+      compare(what, result.data(), expected.data(), 9, roundings, 0);
+    };
+    agree("V diag(w) Vt", V * w * transposed(V), A);
+    agree("VtV", transposed(V) * V, one), agree("RtR", transposed(R) * R, one), agree("RtF", S, transposed(S));
   }
-  compare("V diag(w) Vt", shape, product, A);
-  compare("VtV, RtR", shape, squares, one);
-  compare("RtF", shape, stretch, transposed);
-}
-
-template <class T>
-int check_all(const std::vector<const Pool*>& pools) {
-  std::mt19937 random(1);
-  int examples = 0;
-  for (const int64_t size : {0, 1, 64, 200, 100003}) {
-    for (const bool in_place : {false, true}) check_vectors<T>(size, in_place, random, pools), ++examples;
-  }
-  for (const int64_t nodes : {0, 1, 64, 200, 50003}) {
-    for (int each = 1; each <= 3; ++each) check_product<T>(nodes, each, random, pools), ++examples;
-  }
-  for (const int64_t particles : {0, 1, 16, 53, 9001}) check_matrices<T>(particles, random, pools), ++examples;
-  return examples;
 }
 
 // Keys of few and of many values, and those that lie farthest apart, against the standard library's stable sort.
-int check_order(const std::vector<const Pool*>& pools) {
-  std::mt19937 random(1);
-  int examples = 0;
-  for (const int64_t count : {0, 1, 2, 1000, 70001}) {
-    for (const int64_t reach : {int64_t(1), int64_t(30), int64_t(1) << 20, int64_t(1) << 32}) {
-      const int64_t batch = 2;
-      const Array<int32_t> keys(batch * count), expected(keys.size);
-      for (int64_t i = 0; i < keys.size; ++i) keys[i] = static_cast<int32_t>(random() % reach - reach / 2);
-      for (int64_t m = 0; m < batch; ++m) {
-        int32_t *first = expected.get() + m * count, *last = first + count;
-        std::iota(first, last, 0);
-        std::stable_sort(first, last, [&](int32_t a, int32_t b) { return keys[m * count + a] < keys[m * count + b]; });
-      }
-      for (const Pool* pool : pools) {
-        const Array<int32_t> result(keys.size);
-        order(*pool, batch, Order{keys.get(), result.get(), count});
-        expect_same("an order", expected, result);
-      }
-      ++examples;
-    }
+void check_order(int64_t count, int64_t reach, const Pools& pools) {
+  Random random(1);
+  Order sizes = {};
+  sizes.count = count;
+  const Example<Order> e(sizes, kBatch, random);
+  const int32_t* keys = e.task.keys;
+  for (int64_t i = 0; i < kBatch * count; ++i) changed(keys)[i] = static_cast<int32_t>(random() % reach - reach / 2);
+  e.run_by_all(pools, "order");
+  for (int64_t m = 0; m < kBatch; ++m, keys += count) {
+    std::vector<int32_t> expected(count);
+    std::iota(expected.begin(), expected.end(), 0);
+    std::stable_sort(expected.begin(), expected.end(), [&](int32_t a, int32_t b) { return keys[a] < keys[b]; });
+    expect(std::equal(expected.begin(), expected.end(), e.task.order + m * count), "an order");
   }
-  return examples;
 }
 
 // Numbers in another order and back, in place and elsewhere, wanted and not, with particles that there are not.
 template <class T>
-int check_rearrangement(const std::vector<const Pool*>& pools) {
-  std::mt19937 random(1);
-  int examples = 0;
-  for (const int64_t count : {1, 30, 9001}) {
-    for (const bool inverse : {false, true}) {
-      const int64_t batch = 2, rows = 3, last = count - 1;
-      const Array<bool> wanted(batch);
-      const Array<int32_t> order(batch * count);
-      const Array<T> from(batch * rows * count);
-      wanted[1] = true;
-      for (int64_t m = 0; m < batch; ++m) {
-        std::iota(order.get() + m * count, order.get() + (m + 1) * count, 0);
-        std::shuffle(order.get() + m * count, order.get() + (m + 1) * count, random);
+void check_rearrangement(int64_t count, bool inverse, bool in_place, const Pools& pools) {
+  Random random(1);
+  Rearrangement<T> sizes = {};
+  sizes.rows = 3, sizes.count = count, sizes.inverse = inverse;
+  Example<Rearrangement<T>> e(sizes, kBatch, random);
+  Rearrangement<T>& task = e.task;
+  int32_t* const order = changed(task.order);
+  for (int64_t m = 0; m < kBatch; ++m) {
+    std::iota(order + m * count, order + (m + 1) * count, 0);
+    std::shuffle(order + m * count, order + (m + 1) * count, random);
+    changed(task.wanted)[m] = m == 1;
+  }
+  order[count] = std::numeric_limits<int32_t>::max(), order[2 * count - 1] = -7;
+  std::vector<T> expected(task.from, task.from + kBatch * task.rows * count);
+  for (int64_t i = 0; i < task.rows * count; ++i) {
+    const int64_t row = (task.rows + i / count) * count, k = i % count, other = order[count + k];
+    const int64_t clipped = std::clamp<int64_t>(other, 0, count - 1);
+    if (!inverse) expected[row + k] = task.from[row + clipped];
+    if (inverse && other == clipped) expected[row + other] = task.from[row + k];
+  }
+  std::copy_n(task.from, expected.size(), task.to);
+  if (in_place) task.to = changed(task.from);
+  e.run_by_all(pools, "rearrange");
+  expect(std::equal(expected.begin(), expected.end(), task.to), "a rearrangement");
+}
+
+// Solves of a batch: ‖r‖ is within its tolerance or the steps are used up, a member that may take no step is left as it
+// was, and one that is not finite spoils no other.
+template <class T>
+void check_solve(int d, int64_t particles, int64_t along, const Pools& pools) {
+  constexpr int64_t batch = 3;
+  Random random(1);
+  std::uniform_real_distribution<T> some(1, 2);
+  Solve<T> sizes = {};
+  sizes.stencils.basis = basis_of<T>(d, 3, along, random);
+  sizes.stencils.particles = particles, sizes.nodes = sizes.stencils.basis.strides[0] * along;
+  const int64_t size = sizes.nodes * d, blocks = blocks_of(size);
+  for (const int64_t room : {int64_t(0), kVectors * size}) {
+    sizes.room = room;
+    Example<Solve<T>> e(sizes, batch, random);
+    Solve<T>& task = e.task;
+    for (int64_t i = 0; i < batch * d * particles; ++i) changed(task.stencils.first)[i] = random() % (along - 2);
+    for (int64_t i = 0; i < batch * d * particles; ++i) changed(task.stencils.offset)[i] = some(random) - T(1.5);
+    for (int64_t i = 0; i < batch * matrix_entries(d) * particles; ++i) changed(task.matrices)[i] /= 10;
+    for (int64_t i = 0; i < batch * task.nodes; ++i) changed(task.mass)[i] = some(random);
+    for (int64_t i = 0; i < batch * size; ++i) {
+      const bool active = task.active[i / size * blocks + i % size / kChunk];
+      changed(task.free)[i] = active && task.free[i], changed(task.weight)[i] = some(random);
+      changed(task.start)[i] = active ? some(random) : 0, changed(task.rhs)[i] = task.free[i] ? some(random) : 0;
+    }
+    for (int64_t m = 0; m < batch; ++m) {
+      const T limits[] = {T(1e-2), T(m == 0 ? 0 : 40), T(1e-10)};
+      changed(task.factor)[m] = m + 1 == batch ? NAN : T(0.1) * (m + 1);
+      std::copy_n(limits, kTolerances, changed(task.limits) + m * kTolerances);
+    }
+    for (const Pool* pool : pools) {
+      std::fill_n(task.memory, batch * room, NAN);
+      run(*pool, batch, task);
+      bool fine = task.numbers[1] == 0 && std::equal(task.start, task.start + size, task.x);
+      for (int64_t m = 0; m + 1 < batch; ++m) {
+        const T *numbers = task.numbers + m * kOutcome, *x = task.x + m * size;
+        const bool ended = numbers[1] >= task.limits[m * kTolerances + 1];
+        fine = fine && (ended || std::sqrt(numbers[0]) <= T(1e-2) * numbers[7]);
+        fine = fine && std::all_of(x, x + size, [](T one) { return std::isfinite(one); });
       }
-      order[count] = std::numeric_limits<int32_t>::max(), order[2 * count - 1] = -7;
-      for (int64_t i = 0; i < from.size; ++i) from[i] = T(random() % 1000);
-      Array<T> expected(from);
-      for (int64_t i = 0; i < rows * count; ++i) {
-        const int64_t row = (rows + i / count) * count, k = i % count, other = order[count + k];
-        const int64_t clipped = std::min(std::max<int64_t>(other, 0), last);
-        if (!inverse) expected[row + k] = from[row + clipped];
-        if (inverse && other == clipped) expected[row + other] = from[row + k];
-      }
-      for (const Pool* pool : pools) {
-        for (const bool in_place : {false, true}) {
-          const Array<T> source(from), to(from.size);
-          T* target = in_place ? source.get() : to.get();
-          rearrange(*pool, batch, Rearrangement<T>{wanted.get(), order.get(), source.get(), target, rows,
-                                                   count, inverse});
-          expect_same("a rearrangement", expected, in_place ? source : to);
-        }
-      }
-      ++examples;
+      expect(fine, "a solve of d = " + std::to_string(d));
     }
   }
+}
+
+template <class T>
+int check_all(const Pools& pools) {
+  int examples = 0;
+  for (const int64_t size : {0, 1, 64, 200, 100003}) {
+    for (const bool in_place : {false, true}) check_combinations<T>(size, in_place, pools), ++examples;
+    for (const int64_t each : {1, 2, 3}) check_products<T>(size / 2, each, pools), ++examples;
+  }
+  for (const int64_t particles : {0, 1, 16, 53, 9001}) check_matrices<T>(particles, pools), ++examples;
+  for (const int64_t count : {1, 30, 9001}) {
+    for (const int kind : {0, 1, 2, 3}) check_rearrangement<T>(count, kind % 2, kind / 2, pools), ++examples;
+  }
+  for (int d = 1; d <= 3; ++d) check_solve<T>(d, 53, 6, pools), ++examples;
+  check_solve<T>(2, 20011, 40, pools), ++examples;
   return examples;
 }
 
 }  // namespace
 
-int check_arrays(const std::vector<const Pool*>& pools) {
-  return check_all<float>(pools) + check_all<double>(pools) + check_order(pools) + check_rearrangement<float>(pools) +
-         check_rearrangement<double>(pools);
+int check_arrays(const Pools& pools) {
+  int examples = check_all<float>(pools) + check_all<double>(pools);
+  for (const int64_t count : {0, 1, 2, 1000, 70001}) {
+    for (const int64_t bits : {0, 5, 20, 32}) check_order(count, int64_t(1) << bits, pools), ++examples;
+  }
+  return examples;
 }
 
 }  // namespace mpmjax

@@ -15,6 +15,7 @@
 #include <string>
 #include <unistd.h>
 
+#include "calls.h"
 #include "launches.h"
 
 // Files as text in this library.
@@ -55,38 +56,37 @@ struct Loaded {
     if (handle == nullptr) missing = dlerror();
   }
 
-  template <class F>
-  void find(const char* name, F& function) {
-    if (handle == nullptr) return;
-    function = reinterpret_cast<F>(dlsym(handle, name));
-    if (function == nullptr && missing.empty()) missing = std::string("it has no ") + name;
+  // Becomes a pointer to a function of the type that is asked for.
+  struct Symbol {
+    Handle address;
+    template <class F>
+    operator F*() const { return reinterpret_cast<F*>(address); }
+  };
+
+  Symbol find(const char* name) {
+    const Symbol symbol = {handle == nullptr ? nullptr : dlsym(handle, name)};
+    if (symbol.address == nullptr && missing.empty()) missing = std::string("it has no ") + name;
+    return symbol;
   }
 };
 
 struct Driver : Loaded {
-  int (*init)(unsigned);
-  int (*count)(int*);
-  int (*get_device)(int*, int);
-  int (*retain)(Handle*, int);
-  int (*push)(Handle);
-  int (*pop)(Handle*);
-  int (*context_of)(Handle, Handle*);
-  int (*current_device)(int*);
-  int (*attribute)(int*, int, int);
-  int (*load)(Handle*, const void*);
-  int (*function)(Handle*, Handle, const char*);
-  int (*clear)(unsigned long long, unsigned, size_t, Handle);
-  int (*launch)(Handle, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, Handle, void**, void**);
-  int (*name_error)(int, const char**);
-
-  Driver() : Loaded("libcuda.so.1") {
-    find("cuInit", init), find("cuDeviceGetCount", count), find("cuDeviceGet", get_device);
-    find("cuDevicePrimaryCtxRetain", retain), find("cuCtxPushCurrent_v2", push), find("cuCtxPopCurrent_v2", pop);
-    find("cuStreamGetCtx", context_of), find("cuCtxGetDevice", current_device);
-    find("cuDeviceGetAttribute", attribute), find("cuModuleLoadData", load);
-    find("cuModuleGetFunction", function), find("cuMemsetD32Async", clear);
-    find("cuLaunchKernel", launch), find("cuGetErrorName", name_error);
-  }
+  Driver() : Loaded("libcuda.so.1") {}
+  int (*init)(unsigned) = find("cuInit");
+  int (*count)(int*) = find("cuDeviceGetCount");
+  int (*get_device)(int*, int) = find("cuDeviceGet");
+  int (*retain)(Handle*, int) = find("cuDevicePrimaryCtxRetain");
+  int (*push)(Handle) = find("cuCtxPushCurrent_v2");
+  int (*pop)(Handle*) = find("cuCtxPopCurrent_v2");
+  int (*context_of)(Handle, Handle*) = find("cuStreamGetCtx");
+  int (*current_device)(int*) = find("cuCtxGetDevice");
+  int (*attribute)(int*, int, int) = find("cuDeviceGetAttribute");
+  int (*load)(Handle*, const void*) = find("cuModuleLoadData");
+  int (*function)(Handle*, Handle, const char*) = find("cuModuleGetFunction");
+  int (*clear)(unsigned long long, unsigned, size_t, Handle) = find("cuMemsetD32Async");
+  int (*launch)(Handle, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, Handle, void**, void**) =
+      find("cuLaunchKernel");
+  int (*name_error)(int, const char**) = find("cuGetErrorName");
 
   // Empty for a success.
   std::string fault(int code, const char* what) const {
@@ -98,20 +98,16 @@ struct Driver : Loaded {
 };
 
 struct Compiler : Loaded {
-  int (*version)(int*, int*);
-  int (*create)(Handle*, const char*, const char*, int, const char* const*, const char* const*);
-  int (*compile)(Handle, int, const char* const*);
-  int (*destroy)(Handle*);
-  int (*code_size)(Handle, size_t*);
-  int (*code)(Handle, char*);
-  int (*log_size)(Handle, size_t*);
-  int (*log)(Handle, char*);
-
-  explicit Compiler(const char* path) : Loaded(path) {
-    find("nvrtcVersion", version), find("nvrtcCreateProgram", create), find("nvrtcCompileProgram", compile);
-    find("nvrtcDestroyProgram", destroy), find("nvrtcGetCUBINSize", code_size), find("nvrtcGetCUBIN", code);
-    find("nvrtcGetProgramLogSize", log_size), find("nvrtcGetProgramLog", log);
-  }
+  explicit Compiler(const char* path) : Loaded(path) {}
+  int (*version)(int*, int*) = find("nvrtcVersion");
+  int (*create)(Handle*, const char*, const char*, int, const char* const*, const char* const*) =
+      find("nvrtcCreateProgram");
+  int (*compile)(Handle, int, const char* const*) = find("nvrtcCompileProgram");
+  int (*destroy)(Handle*) = find("nvrtcDestroyProgram");
+  int (*code_size)(Handle, size_t*) = find("nvrtcGetCUBINSize");
+  int (*code)(Handle, char*) = find("nvrtcGetCUBIN");
+  int (*log_size)(Handle, size_t*) = find("nvrtcGetProgramLogSize");
+  int (*log)(Handle, char*) = find("nvrtcGetProgramLog");
 };
 
 const Driver& driver() {
@@ -171,11 +167,10 @@ std::string compiled(const std::string& kernel, const std::string& card, std::st
   return code;
 }
 
-// The text of a kernel, of a type and dimensions such as `float, 3, 3, 4`.
-std::string text_of(const char* problem, const char* kernel, const std::string& types, int terms) {
-  const std::string type = types.substr(0, types.find(','));
+// The text of a kernel: of a problem such as `Gather<float>`, for d, s and columns such as `3, 3, 4`.
+std::string text_of(const std::string& problem, const std::string& dimensions, int terms) {
   return "#define MPMJAX_TERMS " + std::to_string(terms) + "\n#include \"one_thread.h\"\nusing Problem = mpmjax::" +
-         problem + "<" + type + ">;\n#define RUN mpmjax::one_thread::" + kernel + "<" + types + ">" + kKernel;
+         problem + ";\n#define RUN mpmjax::one_thread::run<" + dimensions + ">" + kKernel;
 }
 
 // A kernel in a context, which is current: compiled and loaded once.
@@ -217,27 +212,28 @@ struct Stream {
     fault = driver().fault(driver().clear(place, 0, static_cast<size_t>(words), handle), "clearing nodes");
   }
 
-  template <template <class> class Problem, class T, class Run>
-  void launch(const char* problem, const char* kernel, const Problem<T>& all, int columns, int64_t count, int64_t batch,
-              const Run&) const {
+  template <template <class> class Problem, class T>
+  void launch(const char* name, const Problem<T>& all, int columns, int64_t count, int64_t batch) const {
     if (count == 0 || batch == 0 || !fault.empty()) return;
     const Basis<T>& basis = all.stencils.basis;
-    std::string types = sizeof(T) == sizeof(float) ? "float" : "double";
-    for (const int n : {basis.d, basis.s, columns}) types += ", " + std::to_string(n);
-    const Handle function = function_of(context, text_of(problem, kernel, types, basis.terms), fault);
+    const std::string problem = name + std::string(sizeof(T) == sizeof(float) ? "<float>" : "<double>");
+    const std::string dimensions =
+        std::to_string(basis.d) + ", " + std::to_string(basis.s) + ", " + std::to_string(columns);
+    const Handle function = function_of(context, text_of(problem, dimensions, basis.terms), fault);
     if (!fault.empty()) return;
     void* arguments[] = {const_cast<Problem<T>*>(&all), &count, &batch};
     const auto blocks = static_cast<unsigned>((count + kThreads - 1) / kThreads);
     const auto members = static_cast<unsigned>(std::min(batch, kMostMembers));
     const int code = driver().launch(function, blocks, members, 1, kThreads, 1, 1, 0, handle, arguments, nullptr);
-    fault = driver().fault(code, kernel);
+    fault = driver().fault(code, name);
   }
 };
 
-template <auto for_floats, auto for_doubles>
-ffi::Error run(Handle stream, ffi::Dictionary attributes, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+template <template <class> class Problem>
+ffi::Error run_on_card(Handle stream, ffi::Dictionary attributes, ffi::RemainingArgs arguments,
+                       ffi::RemainingRets results) {
   const Stream on(stream);
-  const ffi::Error error = run_on<for_floats, for_doubles, 2, 1>(on, attributes, arguments, results);
+  const ffi::Error error = run_call<Problem<float>, Problem<double>>(on, attributes, arguments, results);
   return error.success() && !on.fault.empty() ? ffi::Error::Internal("mpmjax's CUDA sums: " + on.fault) : error;
 }
 
@@ -261,7 +257,7 @@ std::string start(const char* nvrtc, const char* cache) {
   fault = driver().fault(driver().retain(&context, device), "the first card");
   if (!fault.empty()) return fault;
   driver().push(context);
-  function_of(context, text_of("Scatter", "scatter", "float, 1, 3, 1", 3), fault);
+  function_of(context, text_of("Scatter<float>", "1, 3, 1", 3), fault);
   driver().pop(&context);
   return fault;
 }
@@ -271,17 +267,12 @@ std::string start(const char* nvrtc, const char* cache) {
 
 #pragma GCC visibility push(default)
 
-#define MPMJAX_HANDLER(name)                                                                                        \
-  XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_##name,                                                                      \
-                                (mpmjax::run<mpmjax::call_##name<float, mpmjax::Stream>,                            \
-                                             mpmjax::call_##name<double, mpmjax::Stream>>),                         \
-                                ffi::Ffi::Bind().Ctx<ffi::PlatformStream<void*>>().Attrs().RemainingArgs().RemainingRets(), \
-                                {ffi::Traits::kCmdBufferCompatible});
-MPMJAX_HANDLER(gather)
-MPMJAX_HANDLER(scatter)
-MPMJAX_HANDLER(average)
-MPMJAX_HANDLER(pull)
-MPMJAX_HANDLER(resist)
+#define MPMJAX_HANDLER(name, Problem)                                                                        \
+  XLA_FFI_DEFINE_HANDLER_SYMBOL(                                                                             \
+      mpmjax_##name, mpmjax::run_on_card<mpmjax::Problem>,                                                   \
+      ffi::Ffi::Bind().Ctx<ffi::PlatformStream<void*>>().Attrs().RemainingArgs().RemainingRets(),            \
+      {ffi::Traits::kCmdBufferCompatible});
+MPMJAX_SUMS(MPMJAX_HANDLER)
 
 extern "C" int mpmjax_interface() { return MPMJAX_INTERFACE; }
 
@@ -292,14 +283,14 @@ extern "C" const char* mpmjax_start(const char* nvrtc, const char* cache) {
 }
 
 // Compiles a kernel for a card, such as sm_90, without one: NVRTC's message, empty for none.
-extern "C" const char* mpmjax_compile(const char* nvrtc, const char* cache, const char* problem, const char* kernel,
-                                      const char* types, int terms, const char* card) {
+extern "C" const char* mpmjax_compile(const char* nvrtc, const char* cache, const char* problem,
+                                      const char* dimensions, int terms, const char* card) {
   static std::string fault;
   fault.clear();
   const std::lock_guard<std::mutex> lock(mpmjax::mutex);
   if (mpmjax::compiler == nullptr) mpmjax::compiler = new mpmjax::Compiler(nvrtc);
   mpmjax::folder = cache;
-  mpmjax::compiled(mpmjax::text_of(problem, kernel, types, terms), card, fault);
+  mpmjax::compiled(mpmjax::text_of(problem, dimensions, terms), card, fault);
   return fault.c_str();
 }
 

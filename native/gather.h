@@ -168,7 +168,7 @@ struct Nodes {
         for (int k = 0; k < numbers; k += kLanes) {
           Vector<T> read[kLanes], turned[kLanes];
           for (int e = 0; e < kLanes; ++e) read[e] = load_as<Vector<T>>(places[e] + k / kLanes * steps[e]);
-          transpose<T>(read, turned);
+          to_rows(read, turned);
           for (int e = 0; e < kLanes && k + e < Row::numbers; ++e) {
             store(reinterpret_cast<T*>(&stored[row].at[k + e]) + p, turned[e]);
           }

@@ -1,95 +1,34 @@
-// What XLA calls: each problem as a handler of its foreign function interface.
-//
-// Sums are read as calls.h says, and others as they are. A solve returns memory that it worked in, of a batch of solves
-// none. The attribute of `rearrange` is `inverse`.
+// What XLA calls: each problem as a handler of its foreign function interface, read as calls.h says. A solve returns
+// memory that it worked in, of a batch of solves none.
 
 #include <cstring>
 
 #include "calls.h"
+#include "solve.h"
 
 namespace mpmjax {
 namespace {
 
-// Which of C, A and B there are say the attributes `affine`, `pushed` and `factored`.
-template <class T>
-void call_p2g(const Pool& pool, Call& call) {
-  const bool affine = call.flag("affine"), pushed = call.flag("pushed"), factored = call.flag("factored");
-  const bool isotropic = call.flag("isotropic"), bent = isotropic && factored;
-  auto task = sum_of<P2G<T>>(call, call.operands + 2);
-  call.expect(task.columns == task.stencils.basis.d + 1, "nodes of another dimension");
-  const std::initializer_list<bool> present = {true, true,   false,  true,     true,      true,     true,
-                                               true, affine, pushed, factored, bent,      isotropic};
-  const size_t operands = 7 + affine + pushed + factored + bent + isotropic;
-  if (call.read(task, operands, 3, present)) p2g(pool, call.batch, task);
-}
+class XlaPool : public Pool {
+ public:
+  explicit XlaPool(ffi::ThreadPool pool) : pool_(pool), threads_(static_cast<int>(pool.num_threads())) {}
+  int threads() const override { return threads_ > 1 ? threads_ : 1; }
+  void schedule(std::function<void()> task) const override { pool_.Schedule(std::move(task)); }
 
-template <class T>
-void call_g2p(const Pool& pool, Call& call) {
-  const bool strained = call.operands > 6;
-  auto task = sum_of<G2P<T>>(call, 2);
-  call.expect(task.columns == task.stencils.basis.d, "a velocity of another dimension");
-  if (call.read(task, 6 + strained, 3 + strained, {true, true, false, true, true, true, true, strained})) {
-    g2p(pool, call.batch, task);
-  }
-}
+ private:
+  mutable ffi::ThreadPool pool_;
+  int threads_;
+};
 
-template <class T>
-void call_solve(const Pool& pool, Call& call) {
-  Solve<T> task = {};
-  take_stencils(call, task.stencils);
-  task.nodes = call.dim(3, 1), task.columns = task.stencils.basis.d;
-  task.room = call.leading.empty() ? kVectors * task.nodes * task.columns : 0;
-  call.expect(task.nodes > 0 || task.stencils.particles == 0, "no nodes to gather from");
-  if (call.read(task, 11, 3, {true, true, false})) solve(pool, call.batch, task);
-}
-
-template <class T>
-void call_combine(const Pool& pool, Call& call) {
-  Combine<T> task = {};
-  task.size = call.dim(0, 1);
-  if (call.read(task, 7, 3)) combine(pool, call.batch, task);
-}
-
-template <class T>
-void call_product(const Pool& pool, Call& call) {
-  Product<T> task = {};
-  task.size = call.dim(0, 1), task.nodes = call.dim(2, 1), task.whole = true;
-  call.expect(task.nodes > 0 ? task.size % task.nodes == 0 : task.size == 0, "nodes with unlike numbers of components");
-  if (call.read(task, 7, 2)) product(pool, call.batch, task);
-}
-
-template <class T>
-void call_eigen(const Pool& pool, Call& call) {
-  Eigen<T> task = {nullptr, nullptr, nullptr, call.dim(0, 1)};
-  if (call.read(task, 1, 2)) eigen(pool, call.batch, task);
-}
-
-template <class T>
-void call_rotation(const Pool& pool, Call& call) {
-  Rotation<T> task = {nullptr, nullptr, call.dim(0, 1)};
-  if (call.read(task, 1, 1)) rotation(pool, call.batch, task);
-}
-
-void call_order(const Pool& pool, Call& call) {
-  Order task = {nullptr, nullptr, call.dim(0, 1)};
-  if (call.read(task, 1, 1)) order(pool, call.batch, task);
-}
-
-template <class T>
-void call_rearrange(const Pool& pool, Call& call) {
-  Rearrangement<T> task = {nullptr, nullptr, nullptr, nullptr, call.dim(2, 2), call.dim(2, 1), call.flag("inverse")};
-  if (call.read(task, 3, 1)) rearrange(pool, call.batch, task);
-}
-
-template <auto for_floats, auto for_doubles, size_t trailing, size_t like>
-ffi::Error run(ffi::ThreadPool threads, ffi::Dictionary attributes, ffi::RemainingArgs arguments,
-               ffi::RemainingRets results) {
-  return run_on<for_floats, for_doubles, trailing, like>(XlaPool(threads), attributes, arguments, results);
+template <class InFloats, class InDoubles>
+ffi::Error run_on_threads(ffi::ThreadPool threads, ffi::Dictionary attributes, ffi::RemainingArgs arguments,
+                          ffi::RemainingRets results) {
+  return run_call<InFloats, InDoubles>(XlaPool(threads), attributes, arguments, results);
 }
 
 // Results lie where the operands do, if XLA has done what it was asked.
 ffi::Error run_stored(ffi::Dictionary attributes, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
-  Call call(arguments, results, attributes, 0);
+  Call call(arguments, results, attributes);
   call.expect(call.buffers.size() == 2 * call.operands, "as many arrays as results");
   for (size_t k = 0; call.fault.empty() && k < call.operands; ++k) {
     const ffi::AnyBuffer &values = call.buffers[k], &result = call.buffers[call.operands + k];
@@ -110,25 +49,20 @@ ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType:
 
 #pragma GCC visibility push(default)
 
-#define MPMJAX_HANDLER(name, ...)                                          \
-  XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_##name, (mpmjax::run<__VA_ARGS__>), \
+#define MPMJAX_HANDLER_OF(name, ...)                                                  \
+  XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_##name, (mpmjax::run_on_threads<__VA_ARGS__>), \
                                 ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attrs().RemainingArgs().RemainingRets());
-#define MPMJAX_HANDLERS(name, trailing, like) \
-  MPMJAX_HANDLER(name, mpmjax::call_##name<float>, mpmjax::call_##name<double>, trailing, like)
-MPMJAX_HANDLERS(gather, 2, 1)
-MPMJAX_HANDLERS(scatter, 2, 1)
-MPMJAX_HANDLERS(average, 2, 1)
-MPMJAX_HANDLERS(pull, 2, 1)
-MPMJAX_HANDLERS(p2g, 2, 1)
-MPMJAX_HANDLERS(g2p, 2, 1)
-MPMJAX_HANDLERS(resist, 2, 1)
-MPMJAX_HANDLERS(solve, 2, 1)
-MPMJAX_HANDLERS(combine, 1, 0)
-MPMJAX_HANDLERS(product, 1, 0)
-MPMJAX_HANDLERS(eigen, 3, 0)
-MPMJAX_HANDLERS(rotation, 3, 0)
-MPMJAX_HANDLERS(rearrange, 0, 2)
-MPMJAX_HANDLER(order, mpmjax::call_order, mpmjax::call_order, 1, 0)
+#define MPMJAX_HANDLER(name, Problem) MPMJAX_HANDLER_OF(name, mpmjax::Problem<float>, mpmjax::Problem<double>)
+MPMJAX_SUMS(MPMJAX_HANDLER)
+MPMJAX_HANDLER(p2g, P2G)
+MPMJAX_HANDLER(g2p, G2P)
+MPMJAX_HANDLER(solve, Solve)
+MPMJAX_HANDLER(combine, Combine)
+MPMJAX_HANDLER(product, Product)
+MPMJAX_HANDLER(eigen, Eigen)
+MPMJAX_HANDLER(rotation, Rotation)
+MPMJAX_HANDLER(rearrange, Rearrangement)
+MPMJAX_HANDLER_OF(order, mpmjax::Order, mpmjax::Order)
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_stored, mpmjax::run_stored,
                               ffi::Ffi::Bind().Attrs().RemainingArgs().RemainingRets());
 

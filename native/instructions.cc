@@ -7,29 +7,6 @@
 
 namespace mpmjax {
 
-// Each is compiled from kernels.cc: those that the build asked for.
-#define MPMJAX_DECLARE(target)                  \
-  extern const KernelSet<float> target##_float; \
-  extern const KernelSet<double> target##_double;
-MPMJAX_DECLARE(avx2)
-MPMJAX_DECLARE(avx512)
-MPMJAX_DECLARE(baseline)
-
-#if defined(MPMJAX_AVX2) && defined(MPMJAX_AVX512)
-#define MPMJAX_CHOSEN(number) (std::strcmp(instructions(), "AVX2") == 0 ? avx2_##number : avx512_##number)
-#elif defined(MPMJAX_AVX2)
-#define MPMJAX_CHOSEN(number) avx2_##number
-#elif defined(MPMJAX_AVX512)
-#define MPMJAX_CHOSEN(number) avx512_##number
-#else
-#define MPMJAX_CHOSEN(number) baseline_##number
-#endif
-
-template <>
-const KernelSet<float>& kernels<float>() { return MPMJAX_CHOSEN(float); }
-template <>
-const KernelSet<double>& kernels<double>() { return MPMJAX_CHOSEN(double); }
-
 namespace {
 
 // The best instruction set, or a lesser one that MPMJAX_INSTRUCTIONS names, for comparisons: avx2, or baseline, which
@@ -62,5 +39,20 @@ const char* instructions() {
   static const char* const chosen = choose();
   return chosen;
 }
+
+template <class T>
+const KernelSet<T>& kernels() {
+#if defined(MPMJAX_AVX2) && defined(MPMJAX_AVX512)
+  return std::strcmp(instructions(), "AVX2") == 0 ? Compiled<avx2, T>::kernels : Compiled<avx512, T>::kernels;
+#elif defined(MPMJAX_AVX2)
+  return Compiled<avx2, T>::kernels;
+#elif defined(MPMJAX_AVX512)
+  return Compiled<avx512, T>::kernels;
+#else
+  return Compiled<baseline, T>::kernels;
+#endif
+}
+template const KernelSet<float>& kernels();
+template const KernelSet<double>& kernels();
 
 }  // namespace mpmjax

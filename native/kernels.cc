@@ -1,21 +1,19 @@
 // All kernels for one instruction set, MPMJAX_TARGET, and one type of numbers, MPMJAX_NUMBER: each pair is compiled by
 // itself, at the same time as others and in a part of the memory. Without a type, both.
 
-#include "gather.h"
+#include "decompositions.h"
 #include "kernels.h"
 #include "passes.h"
 #include "resist.h"
-#include "scatter.h"
-#include "decompositions.h"
 
 namespace {
 
 using mpmjax::Kernels;
 
 template <class T, int d, int s>
-constexpr Kernels<T> sums_of = {gather<T, d, s>, scatter<T, d, s>, average<T, d, s>,         find_ranges<T, d, s>,
-                                pull<T, d, s>,   resist<T, d, s>,  resist_particles<T, d, s>,
-                                p2g<T, d, s>,    g2p<T, d, s>};
+constexpr Kernels<T> sums_of = {{gather<T, d, s>, pull<T, d, s>, g2p<T, d, s>, scatter<T, d, s>, average<T, d, s>,
+                                 p2g<T, d, s>, resist<T, d, s>},
+                                find_ranges<T, d, s>};
 
 template <class T>
 const Kernels<T>* sums(int d, int s) {
@@ -29,18 +27,14 @@ const Kernels<T>* sums(int d, int s) {
 
 namespace mpmjax {
 
-#define MPMJAX_JOINED(a, b) a##_##b
-#define MPMJAX_NAME(target, number) MPMJAX_JOINED(target, number)
-#define MPMJAX_SET(number)                                           \
-  extern const KernelSet<number> MPMJAX_NAME(MPMJAX_TARGET, number); \
-  const KernelSet<number> MPMJAX_NAME(MPMJAX_TARGET, number) = {sums<number>, ::eigen<number>, ::rotation<number>, \
-                                                                ::combine<number>, ::product<number>};
+template <class Target, class T>
+const KernelSet<T> Compiled<Target, T>::kernels = {sums<T>, ::eigen<T>, ::rotation<T>, ::combine<T>, ::product<T>};
 
 #if defined(MPMJAX_NUMBER)
-MPMJAX_SET(MPMJAX_NUMBER)
+template struct Compiled<MPMJAX_TARGET, MPMJAX_NUMBER>;
 #else
-MPMJAX_SET(float)
-MPMJAX_SET(double)
+template struct Compiled<MPMJAX_TARGET, float>;
+template struct Compiled<MPMJAX_TARGET, double>;
 #endif
 
 }  // namespace mpmjax

@@ -1,12 +1,11 @@
-// The sums of a batch as launches of threads that each do one particle or one node, on a card, or in tests one thread
+// The sums of a batch as launches of threads that each do one particle or one node, on a card, or in checks one thread
 // after the other on a CPU.
 //
-// `on.clear(numbers, count)` sets to zero, `on.launch(problem, kernel, all, columns, count, batch, run)` starts so many
-// threads for each of a batch: of the kernel of this name, or run(d, s, columns, one, i).
+// `on.clear(numbers, count)` sets to zero, `on.launch(name, all, columns, count, batch)` calls one_thread::run for each
+// of so many particles or nodes of each member of a problem of this name.
 
 #pragma once
 
-#include "calls.h"
 #include "one_thread.h"
 
 namespace mpmjax {
@@ -18,38 +17,33 @@ int columns_of(const Problem& all) {
 }
 
 template <class T, class On>
-void gather(const On& on, int64_t batch, const Gather<T>& all) {
-  on.launch("Gather", "gather", all, columns_of(all), all.stencils.particles, batch,
-            [](auto d, auto s, auto c, const auto& one, int64_t p) { one_thread::gather<T, d, s, c>(one, p); });
+void run(const On& on, int64_t batch, const Gather<T>& all) {
+  on.launch("Gather", all, columns_of(all), all.stencils.particles, batch);
 }
 
 template <class T, class On>
-void scatter(const On& on, int64_t batch, const Scatter<T>& all) {
+void run(const On& on, int64_t batch, const Scatter<T>& all) {
   on.clear(all.nodes, batch * all.size * all.columns);
-  on.launch("Scatter", "scatter", all, columns_of(all), all.stencils.particles, batch,
-            [](auto d, auto s, auto c, const auto& one, int64_t p) { one_thread::scatter<T, d, s, c>(one, p); });
+  on.launch("Scatter", all, columns_of(all), all.stencils.particles, batch);
 }
 
 template <class T, class On>
-void average(const On& on, int64_t batch, const Average<T>& all) {
-  scatter(on, batch, Scatter<T>{all.stencils, all.values, all.sums, nullptr, nullptr, all.size, all.columns, nullptr});
-  on.launch("Average", "divide", all, 0, all.size, batch,
-            [](auto d, auto s, auto c, const auto& one, int64_t i) { one_thread::divide<T, d, s, c>(one, i); });
+void run(const On& on, int64_t batch, const Average<T>& all) {
+  run(on, batch, Scatter<T>{all.stencils, all.values, all.sums, nullptr, nullptr, all.size, all.columns, nullptr});
+  on.launch("Average", all, 0, all.size, batch);
 }
 
 template <class T, class On>
-void pull(const On& on, int64_t batch, const Pull<T>& all) {
-  on.launch("Pull", "pull", all, columns_of(all), all.stencils.particles, batch,
-            [](auto d, auto s, auto c, const auto& one, int64_t p) { one_thread::pull<T, d, s, c>(one, p); });
+void run(const On& on, int64_t batch, const Pull<T>& all) {
+  on.launch("Pull", all, columns_of(all), all.stencils.particles, batch);
   if (all.value == nullptr) return;
-  gather(on, batch, Gather<T>{all.stencils, all.nodes, all.value, all.gradients, all.size, all.columns});
+  run(on, batch, Gather<T>{all.stencils, all.nodes, all.value, all.gradients, all.size, all.columns});
 }
 
 template <class T, class On>
-void resist(const On& on, int64_t batch, const Resist<T>& all) {
+void run(const On& on, int64_t batch, const Resist<T>& all) {
   on.clear(all.nodes, batch * all.size * all.columns);
-  on.launch("Resist", "resist", all, 0, all.stencils.particles, batch,
-            [](auto d, auto s, auto c, const auto& one, int64_t p) { one_thread::resist<T, d, s, c>(one, p); });
+  on.launch("Resist", all, 0, all.stencils.particles, batch);
 }
 
 }  // namespace mpmjax

@@ -241,8 +241,8 @@ void over_passes(const Stencils<T>& stencils, const Run& run) {
   for (int pass = 0; pass < d; ++pass) run(1u << pass, pass);
 }
 
-template <class T, int d, int s, int columns>
-void scatter(const Scatter<T>& all, int64_t p) {
+template <int d, int s, int columns, class T>
+void run(const Scatter<T>& all, int64_t p) {
   constexpr int c = width_of(columns);
   Particle<T, d, s> at(all.stencils, p);
   over_passes<T, d>(all.stencils, [&](unsigned differentiated, int) {
@@ -254,8 +254,8 @@ void scatter(const Scatter<T>& all, int64_t p) {
   });
 }
 
-template <class T, int d, int s, int columns>
-void gather(const Gather<T>& all, int64_t p) {
+template <int d, int s, int columns, class T>
+void run(const Gather<T>& all, int64_t p) {
   constexpr int c = width_of(columns);
   const int64_t particles = all.stencils.particles;
   Particle<T, d, s> at(all.stencils, p);
@@ -279,8 +279,8 @@ void gather(const Gather<T>& all, int64_t p) {
   });
 }
 
-template <class T, int d, int s, int columns>
-void pull(const Pull<T>& all, int64_t p) {
+template <int d, int s, int columns, class T>
+void run(const Pull<T>& all, int64_t p) {
   constexpr int c = width_of(columns);
   Particle<T, d, s> at(all.stencils, p), slope = at;
   at.evaluate(all.stencils);
@@ -296,8 +296,8 @@ void pull(const Pull<T>& all, int64_t p) {
 }
 
 // r_p = K_p G_p of the gradients G_p of what is gathered, and their scatter.
-template <class T, int d, int s, int>
-void resist(const Resist<T>& all, int64_t p) {
+template <int d, int s, int, class T>
+void run(const Resist<T>& all, int64_t p) {
   const int64_t particles = all.stencils.particles;
   Particle<T, d, s> at(all.stencils, p);
   at.evaluate(all.stencils);
@@ -315,8 +315,8 @@ void resist(const Resist<T>& all, int64_t p) {
 }
 
 // Of a node, once its sums are whole. Where the last column is not more than the least, all are zero.
-template <class T, int, int, int>
-void divide(const Average<T>& all, int64_t i) {
+template <int, int, int, class T>
+void run(const Average<T>& all, int64_t i) {
   const int64_t others = all.columns - 1;
   const T* sums = all.sums + i * all.columns;
   const bool some = sums[others] > all.least[0];

@@ -13,7 +13,8 @@
 // direction is a slope.
 //
 // Each problem lists its arrays once, in the order of XLA's operands and results: `arrays(f)` calls f(pointer, shape)
-// for all of them. `batch` problems follow each other in every array.
+// for all of them, and f(pointer, shape, kOptional) for those that may be null. `batch` problems follow each other in
+// every array.
 
 #pragma once
 
@@ -31,12 +32,22 @@ constexpr int64_t kCached = 1 << 21;            // bytes of an array that a cach
 
 inline int64_t blocks_of(int64_t numbers, int64_t each = kChunk) { return (numbers + each - 1) / each; }
 
+// The length of an array's axis: a size of the problem, which arrays from XLA set, or a number that follows from these.
+struct Length {
+  int64_t value;
+  int64_t* size = nullptr;
+  Length(int64_t& size) : value(size), size(&size) {}
+  Length(const int64_t& number) : value(number) {}
+};
+using Lengths = std::initializer_list<Length>;
+constexpr bool kOptional = true;
+
 // The i-th problem of a batch.
 template <class Problem>
 Problem member(Problem all, int64_t i) {
-  all.arrays([&](auto& array, std::initializer_list<int64_t> shape) {
+  all.arrays([&](auto& array, Lengths shape, bool = false) {
     int64_t numbers = i;
-    for (const int64_t n : shape) numbers *= n;
+    for (const Length& n : shape) numbers *= n.value;
     if (array != nullptr) array += numbers;
   });
   return all;
@@ -64,7 +75,7 @@ struct Stencils {
 
   template <class F>
   void arrays(const F& f) {
-    f(first, {basis.d, particles}), f(offset, {basis.d, particles}), f(change, {basis.d, particles});
+    f(first, {basis.d, particles}), f(offset, {basis.d, particles});
   }
 };
 
@@ -76,8 +87,8 @@ struct ParticleValues {
   int64_t graded;      // k
 
   template <class F>
-  void arrays(const F& f, int64_t d, int64_t columns, int64_t particles) {
-    f(value, {columns, particles}), f(gradients, {d, graded, particles});
+  void arrays(const F& f, int64_t d, int64_t& columns, int64_t& particles) {
+    f(value, {columns, particles}, kOptional), f(gradients, {d, graded, particles}, kOptional);
   }
 };
 
@@ -97,8 +108,10 @@ struct Gather {
 
   template <class F>
   void arrays(const F& f) {
-    stencils.arrays(f), f(nodes, {size, columns});
-    f(value, {columns, stencils.particles}), f(gradients, {stencils.basis.d, columns, stencils.particles});
+    const int d = stencils.basis.d;
+    int64_t& p = stencils.particles;
+    stencils.arrays(f), f(stencils.change, {d, p}, kOptional), f(nodes, {size, columns});
+    f(value, {columns, p}), f(gradients, {d, columns, p});
   }
 };
 
@@ -115,8 +128,11 @@ struct Scatter {
 
   template <class F>
   void arrays(const F& f) {
-    stencils.arrays(f), values.arrays(f, stencils.basis.d, columns, stencils.particles), f(nodes, {size, columns});
-    f(reached, {blocks_of(size)}), f(wanted, {blocks_of(size * columns)});
+    const int d = stencils.basis.d;
+    int64_t& p = stencils.particles;
+    stencils.arrays(f), f(stencils.change, {d, p}, kOptional), values.arrays(f, d, columns, p);
+    f(nodes, {size, columns}), f(reached, {blocks_of(size)}, kOptional);
+    f(wanted, {blocks_of(size * columns)}, kOptional);
   }
 };
 
@@ -137,7 +153,8 @@ struct Average {
   template <class F>
   void arrays(const F& f) {
     stencils.arrays(f), f(least, {}), values.arrays(f, stencils.basis.d, columns, stencils.particles);
-    f(whole, {size}), f(means, {size, columns - 1}), f(sums, {size, columns}), f(reached, {blocks_of(size)});
+    f(whole, {size}), f(means, {size, columns - 1}), f(sums, {size, columns});
+    f(reached, {blocks_of(size)}, kOptional);
   }
 };
 
@@ -161,10 +178,12 @@ struct P2G {
 
   template <class F>
   void arrays(const F& f) {
-    const int64_t d = stencils.basis.d, p = stencils.particles;
+    const int d = stencils.basis.d;
+    int64_t& p = stencils.particles;
     stencils.arrays(f), f(least, {}), f(slope, {}), f(factor, {}), f(mass, {p}), f(v, {d, p});
-    f(C, {d, d, p}), f(A, {d, d, p}), f(B, {d, d, p}), f(q, {p}), f(r, {p});
-    f(whole, {size}), f(means, {size, d}), f(sums, {size, columns}), f(reached, {blocks_of(size)});
+    f(C, {d, d, p}, kOptional), f(A, {d, d, p}, kOptional), f(B, {d, d, p}, kOptional);
+    f(q, {p}, kOptional), f(r, {p}, kOptional);
+    f(whole, {size}), f(means, {size, d}), f(sums, {size, columns}), f(reached, {blocks_of(size)}, kOptional);
   }
 };
 
@@ -184,9 +203,11 @@ struct G2P {
 
   template <class Visit>
   void arrays(const Visit& f) {
-    const int64_t d = stencils.basis.d, p = stencils.particles;
-    stencils.arrays(f), f(nodes, {size, d}), f(slope, {}), f(dt, {}), f(x, {d, p}), f(F, {d, d, p});
-    f(value, {d, p}), f(gradient, {d, d, p}), f(moved, {d, p}), f(strained, {d, d, p});
+    const int d = stencils.basis.d;
+    int64_t& p = stencils.particles;
+    stencils.arrays(f), f(nodes, {size, columns}), f(slope, {}), f(dt, {}), f(x, {d, p});
+    f(F, {d, d, p}, kOptional);
+    f(value, {d, p}), f(gradient, {d, d, p}), f(moved, {d, p}), f(strained, {d, d, p}, kOptional);
   }
 };
 
@@ -203,9 +224,10 @@ struct Pull {
 
   template <class F>
   void arrays(const F& f) {
-    const int64_t d = stencils.basis.d, particles = stencils.particles;
-    stencils.arrays(f), f(nodes, {size, columns}), values.arrays(f, d, columns, particles);
-    f(by_offset, {d, particles}), f(value, {columns, particles}), f(gradients, {d, columns, particles});
+    const int d = stencils.basis.d;
+    int64_t& p = stencils.particles;
+    stencils.arrays(f), f(nodes, {size, columns}), values.arrays(f, d, columns, p), f(by_offset, {d, p});
+    f(value, {columns, p}, kOptional), f(gradients, {d, columns, p}, kOptional);
   }
 };
 
@@ -227,9 +249,10 @@ struct Resist {
 
   template <class F>
   void arrays(const F& f) {
-    stencils.arrays(f), f(matrices, {matrix_entries(columns), stencils.particles});
-    f(moved, {size, columns}), f(nodes, {size, columns});
-    f(gradients, {columns, columns, stencils.particles}), f(wanted, {blocks_of(size * columns)});
+    const int d = stencils.basis.d;
+    int64_t& p = stencils.particles;
+    stencils.arrays(f), f(matrices, {matrix_entries(d), p}), f(moved, {size, columns}), f(nodes, {size, columns});
+    f(gradients, {d, d, p}, kOptional), f(wanted, {blocks_of(size * columns)}, kOptional);
   }
 };
 
@@ -255,15 +278,15 @@ struct Solve {
   // recurrence, whether that has not halved ‖r‖, ‖W⁻¹b‖, and ‖x‖, all in the norm of W.
   T* numbers;
   T* memory;  // to work in
-  int64_t nodes, columns;
+  int64_t nodes;
   int64_t room;  // numbers in `memory`: kVectors times those of x, or none where each problem takes its own
 
   template <class F>
   void arrays(const F& f) {
-    const int64_t size = nodes * columns;
-    stencils.arrays(f), f(matrices, {matrix_entries(columns), stencils.particles});
-    f(mass, {nodes}), f(factor, {}), f(free, {size}), f(weight, {size}), f(active, {blocks_of(size)});
-    f(start, {size}), f(rhs, {size}), f(limits, {kTolerances}), f(x, {size}), f(numbers, {kOutcome}), f(memory, {room});
+    stencils.arrays(f), f(matrices, {matrix_entries(stencils.basis.d), stencils.particles}), f(mass, {nodes});
+    const int64_t size = nodes * stencils.basis.d;
+    f(factor, {}), f(free, {size}), f(weight, {size}), f(active, {blocks_of(size)}), f(start, {size}), f(rhs, {size});
+    f(limits, {kTolerances}), f(x, {size}), f(numbers, {kOutcome}), f(memory, {room});
   }
 };
 
@@ -298,7 +321,7 @@ struct Product {
   const bool* active;
   T *image, *sum;
   int64_t size, nodes;
-  bool whole;
+  bool whole = true;
 
   template <class F>
   void arrays(const F& f) {

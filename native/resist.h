@@ -62,7 +62,7 @@ MPMJAX_NOINLINE void resist_block(const Resist<T>& task, const Block<T, d, s>& b
 
 // Sets the nodes of a range.
 template <class T, int d, int s>
-void resist(const Resist<T>& task, int64_t first, int64_t last) {
+void set_resisted(const Resist<T>& task, int64_t first, int64_t last) {
   clear(task.nodes, task.wanted, first * d, last * d);
   const NodeSums<T, s, d> nodes(task.nodes, d, 0, first, last);
   const auto give = [&](const auto& block, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
@@ -74,9 +74,9 @@ void resist(const Resist<T>& task, int64_t first, int64_t last) {
   add_blocks<T, d, s, true, d>(task.stencils, task.ranges, nodes, give);
 }
 
-// Stores r_p,b, for a scatter.
+// Stores r_p,b of some particles, for a scatter.
 template <class T, int d, int s>
-void resist_particles(const Resist<T>& task, int64_t first, int64_t last) {
+void store_resisted(const Resist<T>& task, int64_t first, int64_t last) {
   for (int64_t start = first; start < last; start += kBlock) {
     const int count = smaller(last - start, kBlock);
     Block<T, d, s> block;
@@ -86,6 +86,11 @@ void resist_particles(const Resist<T>& task, int64_t first, int64_t last) {
     resist_block<T, d, s>(task, block, start, count, products);
     for (int k = 0; k < d * d; ++k) write(products[k], count, task.gradients + k * task.stencils.particles + start);
   }
+}
+
+template <class T, int d, int s>
+void resist(const Resist<T>& task, int64_t first, int64_t last) {
+  task.gradients == nullptr ? set_resisted<T, d, s>(task, first, last) : store_resisted<T, d, s>(task, first, last);
 }
 
 }  // namespace

@@ -5,8 +5,6 @@
 
 #pragma once
 
-#include <utility>
-
 #include "vector.h"
 #if defined(__AVX2__)
 #include <immintrin.h>
@@ -68,29 +66,6 @@ struct Row {
 // All columns of the nodes, or where their number is 0 when this is compiled, four of any number.
 template <class T, int s, int columns>
 using RowOf = Row<T, s, columns == 0 ? kLanes : columns, columns == 0 ? 1 : fitting<T>(s, columns)>;
-
-// A vector of chosen lanes of another; where the number of a lane is -1 it holds anything.
-template <class V, class From, int... lane>
-MPMJAX_INLINE V shuffled(From from, std::integer_sequence<int, lane...>) {
-#if defined(__clang__) || __GNUC__ >= 12
-  return __builtin_shufflevector(from, from, lane...);
-#else
-  return V{from[lane < 0 ? 0 : lane]...};
-#endif
-}
-
-// Lanes chosen from two vectors, those of the second counted on.
-template <class V, class M, int... lane>
-MPMJAX_INLINE V shuffled(V a, V b, M, std::integer_sequence<int, lane...>) {
-#if defined(__clang__) || __GNUC__ >= 12
-  return __builtin_shufflevector(a, b, lane...);
-#else
-  return __builtin_shuffle(a, b, M{lane...});
-#endif
-}
-
-template <int count>
-using Count = std::make_integer_sequence<int, count>;
 
 // For the lanes of a part, their nodes and their columns.
 template <class R, int part, int... lane>

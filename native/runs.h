@@ -58,9 +58,7 @@ MPMJAX_INLINE Simd<T> column_of(const Simd<T>* parts, Simd<T> joined) {
   if constexpr (part == columns) {
     return joined;
   } else {
-    constexpr int lanes = kSimdLanes<T>;
-    const auto next = shuffled(joined, parts[part], LanesOf<T, lanes>(),
-                             taken_of<columns, c, part>(Count<lanes>()));
+    const auto next = shuffled(joined, parts[part], taken_of<columns, c, part>(Count<kSimdLanes<T>>()));
     return column_of<T, columns, c, part + 1>(parts, next);
   }
 }

@@ -373,7 +373,7 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
         V given[kLanes] = {};
         for (int r = 0; r < d; ++r) given[r] = m * read(task.v, r);
         given[d] = m;
-        to_rows<T>(given, rows[0] + k);
+        to_rows(given, rows[0] + k);
         given[d] = V{};
         const V q = task.q == nullptr ? V{} : factor * read(task.q, 0);
         const V even = task.r == nullptr ? V{} : factor * read(task.r, 0);
@@ -394,7 +394,7 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
             for (int l = 0; l < d && task.B != nullptr; ++l) given[r] += A[r][l] * B[b][l];
           }
           given[b] += even;
-          to_rows<T>(given, rows[b + 1] + k);
+          to_rows(given, rows[b + 1] + k);
         }
       });
     }

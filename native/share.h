@@ -3,8 +3,12 @@
 #pragma once
 
 #include <algorithm>
+#include <atomic>
+#include <condition_variable>
 #include <cstdint>
 #include <functional>
+#include <memory>
+#include <mutex>
 
 namespace mpmjax {
 
@@ -16,10 +20,56 @@ class Pool {
   virtual void schedule(std::function<void()> task) const = 0;
 };
 
+// How often a thread looks whether the others are done before it sleeps, which takes some tens of microseconds at most.
+// To be woken may take as long, and shares are of about the same length.
+constexpr int kSpins = 1000;
+
+inline void pause() {
+#if defined(__x86_64__)
+  __builtin_ia32_pause();
+#endif
+}
+
+// Outlives the call that made it: helpers that come late find that nothing is left.
+struct Work {
+  std::atomic<int64_t> next{0}, done{0};
+  int64_t count;
+  const std::function<void(int64_t)>* run;  // valid until all is done
+  std::mutex mutex;
+  std::condition_variable changed;
+
+  void help() {
+    for (int64_t i; (i = next.fetch_add(1)) < count;) {
+      (*run)(i);
+      if (done.fetch_add(1) + 1 == count) {
+        const std::lock_guard<std::mutex> lock(mutex);
+        changed.notify_one();
+      }
+    }
+  }
+};
+
 // Calls run(0), ..., run(count - 1), each once, on this thread and on those of the pool that come in time, and returns
 // when all are done. This thread takes whatever nobody else has begun, so it never waits for a thread that is held by
 // another program or by a caller that waits too.
-void share(const Pool& pool, int64_t count, const std::function<void(int64_t)>& run);
+inline void share(const Pool& pool, int64_t count, const std::function<void(int64_t)>& run) {
+  const int64_t helpers = std::min<int64_t>(pool.threads(), count) - 1;
+  if (helpers <= 0) {
+    for (int64_t i = 0; i < count; ++i) run(i);
+    return;
+  }
+  const auto work = std::make_shared<Work>();
+  work->count = count;
+  work->run = &run;
+  for (int64_t i = 0; i < helpers; ++i) pool.schedule([work] { work->help(); });
+  work->help();
+  for (int k = 0; k < kSpins; ++k) {
+    if (work->done.load() == count) return;
+    pause();
+  }
+  std::unique_lock<std::mutex> lock(work->mutex);
+  work->changed.wait(lock, [&] { return work->done.load() == count; });
+}
 
 // Calls run(m, first, last) for parts, of so many, of what each member m of a batch has.
 template <class Run>

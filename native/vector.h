@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <cstring>
 #include <type_traits>
+#include <utility>
 
 #define MPMJAX_INLINE inline __attribute__((always_inline))
 #define MPMJAX_INLINE_LAMBDA __attribute__((always_inline))
@@ -62,21 +63,49 @@ MPMJAX_INLINE void store(T* to, V v) {
   std::memcpy(to, &v, sizeof v);
 }
 
-#if defined(__clang__)
-#define MPMJAX_SHUFFLE(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, k, l)
+// A vector of chosen lanes of another; where the number of a lane is -1 it holds anything.
+template <class V, class From, int... lane>
+MPMJAX_INLINE V shuffled(From from, std::integer_sequence<int, lane...>) {
+#if defined(__clang__) || __GNUC__ >= 12
+  return __builtin_shufflevector(from, from, lane...);
 #else
-#define MPMJAX_SHUFFLE(a, b, i, j, k, l) __builtin_shuffle(a, b, LanesOf<T, kLanes>{i, j, k, l})
+  return V{from[lane < 0 ? 0 : lane]...};
 #endif
+}
 
-// The transpose of four vectors.
-template <class T>
-MPMJAX_INLINE void transpose(const Vector<T>* from, Vector<T>* to) {
-  const Vector<T> a = MPMJAX_SHUFFLE(from[0], from[1], 0, 4, 1, 5), b = MPMJAX_SHUFFLE(from[0], from[1], 2, 6, 3, 7);
-  const Vector<T> c = MPMJAX_SHUFFLE(from[2], from[3], 0, 4, 1, 5), d = MPMJAX_SHUFFLE(from[2], from[3], 2, 6, 3, 7);
-  to[0] = MPMJAX_SHUFFLE(a, c, 0, 1, 4, 5);
-  to[1] = MPMJAX_SHUFFLE(a, c, 2, 3, 6, 7);
-  to[2] = MPMJAX_SHUFFLE(b, d, 0, 1, 4, 5);
-  to[3] = MPMJAX_SHUFFLE(b, d, 2, 3, 6, 7);
+// Lanes chosen from two vectors, those of the second counted on.
+template <class V, int... lane>
+MPMJAX_INLINE V shuffled(V a, V b, std::integer_sequence<int, lane...>) {
+#if defined(__clang__) || __GNUC__ >= 12
+  return __builtin_shufflevector(a, b, lane...);
+#else
+  return __builtin_shuffle(a, b, LanesOf<std::decay_t<decltype(a[0])>, sizeof...(lane)>{lane...});
+#endif
+}
+
+template <int count>
+using Count = std::make_integer_sequence<int, count>;
+
+// Two vectors' lanes in turn, so many of each at a time: of their first halves, or of their second ones.
+template <int together, int half, int lanes, int... lane>
+constexpr auto in_turn(std::integer_sequence<int, lane...>) {
+  return std::integer_sequence<int, (half * lanes / 2 + lane / (2 * together) * together + lane % together +
+                                     lane / together % 2 * lanes)...>();
+}
+template <int together, int half, class V>
+MPMJAX_INLINE V zipped(V a, V b) {
+  constexpr int lanes = sizeof(V) / sizeof(a[0]);
+  return shuffled(a, b, in_turn<together, half, lanes>(Count<lanes>()));
+}
+
+// Four columns of a vector's lanes as rows of four, one for each lane.
+template <class V, class Rows>
+MPMJAX_INLINE void to_rows(const V* columns, Rows* rows) {
+  const V pairs[] = {zipped<1, 0>(columns[0], columns[1]), zipped<1, 0>(columns[2], columns[3]),
+                     zipped<1, 1>(columns[0], columns[1]), zipped<1, 1>(columns[2], columns[3])};
+  const V fours[] = {zipped<2, 0>(pairs[0], pairs[1]), zipped<2, 1>(pairs[0], pairs[1]),
+                     zipped<2, 0>(pairs[2], pairs[3]), zipped<2, 1>(pairs[2], pairs[3])};
+  std::memcpy(rows, fours, sizeof fours);
 }
 
 // Calls f(0), ..., f(count - 1): unrolled with constants, or as a loop where speed matters less than the size of the

@@ -45,17 +45,14 @@ class OneByOne(AbstractBackend):
 
     name = "one by one"
     platform = "cpu"
+    prefix = "one_thread_"
     has = _backend.Cuda.has
-
-    def call(self, kernel, operands, results, attributes, aliases=None):
-        told = {key: np.bool_(value) if isinstance(value, bool) else value for key, value in attributes.items()}
-        return list(jax.ffi.ffi_call(f"one_thread_{kernel}", list(results))(*operands, **told))
 
 
 @pytest.fixture(scope="session")
 def kernels(pytestconfig):
     """Kernels for a CPU, compiled once and kept in pytest's cache as long as their sources are the same."""
-    names = "check_one_thread.cc", "launches.h", "one_thread.h", "calls.h", "call.h", "kernels.h", "problems.h"
+    names = "check_one_thread.cc", "one_by_one.h", "launches.h", "one_thread.h", "calls.h", "problems.h"
     sources = b"".join((NATIVE / name).read_bytes() for name in names) + jax.__version__.encode()
     folder = pytestconfig.cache.mkdir("one_thread")
     path = folder / f"{hashlib.sha256(sources).hexdigest()[:16]}.so"
@@ -151,18 +148,22 @@ def test_a_particle_that_is_not_finite_spoils_its_own_nodes_alone(one_by_one):
 
 @NEEDS_NVRTC
 @pytest.mark.parametrize("card", ["sm_90", *thorough("sm_80", "sm_100")])
-@pytest.mark.parametrize("types", ["float, 3, 3, 4", *thorough("double, 3, 4, 0", "float, 2, 3, 2", "double, 1, 2, 1")])
-def test_nvrtc_compiles_the_kernels(card, types, tmp_path):
+@pytest.mark.parametrize(
+    ("number", "dimensions"),
+    [("float", "3, 3, 4"), *thorough(("double", "3, 4, 0"), ("float", "2, 3, 2"), ("double", "1, 2, 1"))],
+)
+def test_nvrtc_compiles_the_kernels(card, number, dimensions, tmp_path):
     """For cards of these capabilities, none of which is here; and what was compiled is kept."""
     library = ctypes.CDLL(str(_library.CUDA_PATH))
     library.mpmjax_compile.restype = ctypes.c_char_p
-    kernels = {"scatter": "Scatter", "gather": "Gather", "pull": "Pull", "resist": "Resist", "divide": "Average"}
-    for name, of in kernels.items():
-        texts = (text.encode() for text in (NVRTC[0], str(tmp_path), of, name, types))
-        assert library.mpmjax_compile(*texts, 3, card.encode()).decode() == ""
-    assert len(list(tmp_path.glob("*.cubin"))) == len(kernels)
-    broken = [text.encode() for text in (NVRTC[0], str(tmp_path), "Scatter", "nothing", types)]
-    assert "nothing" in library.mpmjax_compile(*broken, 3, card.encode()).decode()
+
+    def fault(name):
+        texts = (text.encode() for text in (NVRTC[0], str(tmp_path), f"{name}<{number}>", dimensions))
+        return library.mpmjax_compile(*texts, 3, card.encode()).decode()
+
+    assert [fault(name.capitalize()) for name in _library.CUDA_KERNELS] == [""] * 5
+    assert len(list(tmp_path.glob("*.cubin"))) == 5
+    assert "Nothing" in fault("Nothing")
 
 
 STAND_INS = """

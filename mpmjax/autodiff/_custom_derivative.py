@@ -216,7 +216,7 @@ def _by_kernel(chosen: AbstractBackend, arrays: Sequence[Array], call: _Call) ->
     kernel: str = function.kernel
 
     def called(
-        operands: Sequence[Array],
+        operands: Sequence[Array | None],
         attributes: dict[str, Any],
         results: Structs | None = None,
         aliases: dict[int, int] | None = function.aliases,

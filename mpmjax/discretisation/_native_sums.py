@@ -38,11 +38,10 @@ def _have_kernels(basis: Basis, groups: Sequence[Any]) -> bool:
     return len(set(terms)) == len(terms) and all(some in (basis.value, basis.gradient) for some, _ in terms)
 
 
-def _given(basis: Basis, amounts: dict[Any, Array]) -> tuple[list[Array], bool]:
-    """Value and gradients as kernels are given them, and whether there is a value. It has no fewer columns."""
-    value, gradients = amounts.get(basis.value), amounts.get(basis.gradient)
-    rows = [] if value is None else [value[..., 0, :, :]]
-    return rows + ([] if gradients is None else [gradients]), value is not None
+def _given(basis: Basis, amounts: dict[Any, Array]) -> list[Array | None]:
+    """Value and gradients as kernels are given them. The value has no fewer columns."""
+    value = amounts.get(basis.value)
+    return [None if value is None else value[..., 0, :, :], amounts.get(basis.gradient)]
 
 
 def call_scatter(
@@ -62,9 +61,7 @@ def call_scatter(
     total = []
     for moved in dict.fromkeys(group.moved for group in groups):
         some = {g.terms: a for g, a in zip(groups, rows, strict=True) if g.moved == moved}
-        amounts, valued = _given(basis, some)
-        told = basis_attributes(basis) | {"differential": moved, "valued": valued}
-        total += call([first, t, *([dt] if moved else []), *amounts], told)
+        total += call([first, t, dt if moved else None, *_given(basis, some)], basis_attributes(basis))
     return sum(total[1:], total[0])
 
 
@@ -76,9 +73,8 @@ def call_gather(
         return None
     out = {}
     for moved in {group.moved for group in groups}:
-        told = basis_attributes(basis) | {"differential": moved}
-        operands = [first, t, *([dt] if moved else []), nodes]
-        value, gradients = call(operands, told, results=_value_and_gradients(t, nodes))
+        operands = [first, t, dt if moved else None, nodes]
+        value, gradients = call(operands, basis_attributes(basis), results=_value_and_gradients(t, nodes))
         out[basis.value, moved], out[basis.gradient, moved] = jnp.expand_dims(value, -3), gradients
     return [out[group.terms, group.moved] for group in groups]
 
@@ -103,9 +99,9 @@ def call_pull(
     if not _have_kernels(basis, groups):
         return None
     terms = [group.terms for group in groups]
-    amounts, valued = _given(basis, dict(zip(terms, rows, strict=True)))
+    operands = [first, t, nodes, *_given(basis, dict(zip(terms, rows, strict=True)))]
     results = [jax.ShapeDtypeStruct(t.shape[-2:], t.dtype), *(_value_and_gradients(t, nodes) if gathered else [])]
-    by_t, *out = call([first, t, nodes, *amounts], basis_attributes(basis) | {"valued": valued}, results=results)
+    by_t, *out = call(operands, basis_attributes(basis), results=results)
     of = {basis.value: jnp.expand_dims(out[0], -3), basis.gradient: out[1]} if gathered else {}
     return by_t, [of[some] for some in terms if gathered]
 
@@ -122,7 +118,7 @@ def call_average(
     size: int,
 ) -> list[Array]:
     """`average_sum`."""
-    amounts, _ = _given(basis, dict(zip((group.terms for group in groups), rows, strict=True)))
+    amounts = _given(basis, dict(zip((group.terms for group in groups), rows, strict=True)))
     columns = rows[0].shape[-2]
     shapes = (size,), (size, columns - 1), (size, columns)  # the last one holds the sums before they are divided
     results = [jax.ShapeDtypeStruct(shape, t.dtype) for shape in shapes]
@@ -138,12 +134,10 @@ def call_p2g(
     factor, A, B = (jnp.zeros_like(least), None, None) if impulse is None else impulse
     A, q, r = (None, *A) if isinstance(A, tuple) else (A, None, None)
     operands = [stencil.first, stencil.offset, least, stencil.slope, factor, mass, v, C, A, B, q, r]
-    names = "affine", "pushed", "factored", "isotropic"
-    told = dict(zip(names, (a is not None for a in (C, A, B, r)), strict=True))
     d = v.shape[-2]
     shapes = (size,), (size, d), (size, d + 1)  # the last one holds the sums before they are divided
     results = [jax.ShapeDtypeStruct(shape, v.dtype) for shape in shapes]
-    return call([a for a in operands if a is not None], basis_attributes(basis) | told, results=results)[:2]
+    return call(operands, basis_attributes(basis), results=results)[:2]
 
 
 def call_g2p(
@@ -152,7 +146,5 @@ def call_g2p(
     """`g2p_sum`, but for stencils with gradients of their own or without any. Particles are moved in place."""
     if stencil.own_derivatives is not None or stencil.flat is not None:
         return None
-    operands, aliases = [stencil.first, stencil.offset, nodes, stencil.slope, dt, x], {5: 2}
-    if F is not None:
-        operands, aliases = [*operands, F], {5: 2, 6: 3}
-    return call(operands, basis_attributes(basis), aliases=aliases)
+    operands = [stencil.first, stencil.offset, nodes, stencil.slope, dt, x, F]
+    return call(operands, basis_attributes(basis), aliases={5: 2} if F is None else {5: 2, 6: 3})

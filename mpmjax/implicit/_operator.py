@@ -13,7 +13,7 @@ from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scal
 from mpmjax.autodiff import custom_derivative
 from mpmjax.implicit._potential import AbstractHessianAction, ElasticPotential, ParticleStiffness
 
-_BLOCK_SIZE = 64  # as in native/vectors.h
+_BLOCK_SIZE = 64  # as in native/problems.h
 
 
 class Projection(eqx.Module):

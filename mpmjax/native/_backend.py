@@ -21,6 +21,7 @@ class AbstractBackend(eqx.Module):
     reason: str  # why it is this one
     name: ClassVar[str]  # the name in MPMJAX_BACKEND and in reports
     platform: ClassVar[str]  # the platform of JAX, such as cpu
+    prefix: ClassVar[str] = "mpmjax_"  # of the names that its kernels have in XLA's registry
     gains_from_order: ClassVar[bool] = False
     """Whether sorting particles by cell saves more time in its sums than it takes."""
     by_default: ClassVar[bool] = True  # whether it is taken without being asked for
@@ -38,23 +39,24 @@ class AbstractBackend(eqx.Module):
     def call(
         self,
         kernel: str,
-        operands: Sequence[Array],
+        operands: Sequence[Array | None],
         results: Sequence[jax.ShapeDtypeStruct],
         attributes: dict[str, Any],
         aliases: dict[int, int] | None = None,
     ) -> list[Array]:
-        """The results of a kernel, called through XLA's foreign function interface as `mpmjax_` and its name.
+        """The results of a kernel, called through XLA's foreign function interface by its name.
 
         Args:
             kernel: its name.
-            operands: arrays; in a batch all have the same leading axes.
+            operands: arrays, None for those that the kernel can do without; in a batch all have the same leading axes.
             results: their shapes and dtypes.
             attributes: numpy's arrays, and booleans.
             aliases: operands whose memory results may take, from their number to that of the result.
         """
-        called = jax.ffi.ffi_call(f"mpmjax_{kernel}", list(results), input_output_aliases=aliases or {})
+        called = jax.ffi.ffi_call(self.prefix + kernel, list(results), input_output_aliases=aliases or {})
         told = {key: np.bool_(value) if isinstance(value, bool) else value for key, value in attributes.items()}
-        return list(called(*operands, **told))
+        present = np.array([a is not None for a in operands], np.int64)
+        return list(called(*(a for a in operands if a is not None), **told, present=present))
 
 
 class XLA(AbstractBackend):

@@ -1,13 +1,15 @@
 // Solves of a batch, on all threads.
 
+#pragma once
+
 #include <cmath>
 #include <limits>
 #include <memory>
 
-#include "kernels.h"
+#include "arrays.h"
+#include "sums.h"
 
 namespace mpmjax {
-namespace {
 
 class OneThread : public Pool {
  public:
@@ -20,14 +22,14 @@ template <class T>
 class Solver {
  public:
   Solver(const Pool& pool, const Solve<T>& task)
-      : pool_(pool), task_(task), size_(task.nodes * task.columns),
+      : pool_(pool), task_(task), size_(task.nodes * task.stencils.basis.d),
         allocated_(task.room == 0 ? new T[kVectors * size_] : nullptr),
         r_(task.room == 0 ? allocated_.get() : task.memory), p_(r_ + size_), q_(p_ + size_),
         moved_(q_ + size_), image_(moved_ + size_), last_(image_ + size_) {
     resistance_.stencils = task.stencils, resistance_.matrices = task.matrices, resistance_.moved = moved_;
     resistance_.nodes = image_, resistance_.wanted = task.active;
-    resistance_.size = task.nodes, resistance_.columns = task.columns;
-    division_ = divided(pool, 1, resistance_);
+    resistance_.size = task.nodes, resistance_.columns = task.stencils.basis.d;
+    division_ = divide(pool, 1, resistance_);
     std::fill(moved_, moved_ + size_, T(0));
     if (task.x != task.start) std::copy(task.start, task.start + size_, task.x);
   }
@@ -76,16 +78,16 @@ class Solver {
   // W⁻¹A v into the image; returns vᵀA v.
   T apply(const T* v) {
     over_active([&](int64_t i) { moved_[i] = task_.free[i] ? v[i] : T(0); });
-    resist(pool_, 1, resistance_, division_);
+    mpmjax::run(pool_, 1, resistance_, division_);
     T result;
-    product(pool_, 1, Product<T>{image_, v, task_.mass, task_.factor, task_.free, task_.weight, task_.active, image_,
+    mpmjax::run(pool_, 1, Product<T>{image_, v, task_.mass, task_.factor, task_.free, task_.weight, task_.active, image_,
                                  &result, size_, task_.nodes, false});
     return result;
   }
 
   T combine_with(const T* a, const T* b, const T* c, const T* d, const T* scales, T* y, T* z) {
     T result;
-    combine(pool_, 1, Combine<T>{a, b, c, d, scales, task_.weight, task_.active, y, z, &result, size_});
+    mpmjax::run(pool_, 1, Combine<T>{a, b, c, d, scales, task_.weight, task_.active, y, z, &result, size_});
     return result;
   }
 
@@ -126,18 +128,15 @@ class Solver {
   bool vanished_ = false, negative_ = false;
 };
 
-}  // namespace
-
+// Each ends by itself. As many as there are threads or more are shared among them whole, each with its arrays in the
+// cache of one core; fewer are done one by one by all threads.
 template <class T>
-void solve(const Pool& pool, int64_t batch, const Solve<T>& all) {
+void run(const Pool& pool, int64_t batch, const Solve<T>& all) {
   if (batch >= pool.threads()) {
     share(pool, batch, [&](int64_t i) { Solver<T>(OneThread(), member(all, i)).run(); });
   } else {
     for (int64_t i = 0; i < batch; ++i) Solver<T>(pool, member(all, i)).run();
   }
 }
-
-template void solve(const Pool&, int64_t, const Solve<float>&);
-template void solve(const Pool&, int64_t, const Solve<double>&);
 
 }  // namespace mpmjax

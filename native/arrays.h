@@ -1,5 +1,7 @@
 // Passes over arrays, of a batch, on all threads: vectors of a solve, decompositions, and orders of particles.
 
+#pragma once
+
 #include <algorithm>
 #include <array>
 #include <memory>
@@ -7,9 +9,9 @@
 #include <vector>
 
 #include "kernels.h"
+#include "share.h"
 
 namespace mpmjax {
-namespace {
 
 constexpr int64_t kBlocks = 128;  // of kChunk numbers, some microseconds: what a thread takes at a time
 constexpr int64_t kMatrices = 4096;
@@ -35,7 +37,7 @@ constexpr uint32_t kDigits = 1u << kBits;
 
 // A counting sort by one digit after the other, the last digit first. Digits in which no two keys differ are passed
 // over.
-void sort(const Order& all) {
+inline void sort(const Order& all) {
   if (all.count == 0) return;
   const auto [least, most] = std::minmax_element(all.keys, all.keys + all.count);
   const uint32_t base = static_cast<uint32_t>(*least), reach = static_cast<uint32_t>(*most) - base;
@@ -54,35 +56,29 @@ void sort(const Order& all) {
   }
 }
 
-}  // namespace
-
-template <class T>
-void combine(const Pool& pool, int64_t batch, const Combine<T>& all) {
-  add_up(pool, batch, all, kernels<T>().combine);
+template <class Problem>
+void over_matrices(const Pool& pool, int64_t batch, const Problem& all, Kernel<Problem> kernel) {
+  share_parts(pool, batch, all.particles, kMatrices,
+              [&](int64_t m, int64_t first, int64_t last) { kernel(member(all, m), first, last); });
 }
 
 template <class T>
-void product(const Pool& pool, int64_t batch, const Product<T>& all) {
-  add_up(pool, batch, all, kernels<T>().product);
-}
-
+void run(const Pool& pool, int64_t batch, const Combine<T>& all) { add_up(pool, batch, all, kernels<T>().combine); }
 template <class T>
-void eigen(const Pool& pool, int64_t batch, const Eigen<T>& all) {
-  share_parts(pool, batch, all.particles, kMatrices, [&](int64_t m, int64_t first, int64_t last) {
-    kernels<T>().eigen(member(all, m), first, last);
-  });
-}
-
+void run(const Pool& pool, int64_t batch, const Product<T>& all) { add_up(pool, batch, all, kernels<T>().product); }
 template <class T>
-void rotation(const Pool& pool, int64_t batch, const Rotation<T>& all) {
-  share_parts(pool, batch, all.particles, kMatrices, [&](int64_t m, int64_t first, int64_t last) {
-    kernels<T>().rotation(member(all, m), first, last);
-  });
+void run(const Pool& pool, int64_t batch, const Eigen<T>& all) { over_matrices(pool, batch, all, kernels<T>().eigen); }
+template <class T>
+void run(const Pool& pool, int64_t batch, const Rotation<T>& all) {
+  over_matrices(pool, batch, all, kernels<T>().rotation);
+}
+inline void run(const Pool& pool, int64_t batch, const Order& all) {
+  share(pool, batch, [&](int64_t m) { sort(member(all, m)); });
 }
 
 // Numbers of no particle are clipped where one is read, and dropped where one is written.
 template <class T>
-void rearrange(const Pool& pool, int64_t batch, const Rearrangement<T>& all) {
+void run(const Pool& pool, int64_t batch, const Rearrangement<T>& all) {
   if (all.from == all.to && std::none_of(all.wanted, all.wanted + batch, [](bool one) { return one; })) return;
   share(pool, batch * all.rows, [&](int64_t i) {
     const Rearrangement<T> one = member(all, i / all.rows);
@@ -98,18 +94,5 @@ void rearrange(const Pool& pool, int64_t batch, const Rearrangement<T>& all) {
     }
   });
 }
-
-void order(const Pool& pool, int64_t batch, const Order& all) {
-  share(pool, batch, [&](int64_t m) { sort(member(all, m)); });
-}
-
-#define MPMJAX_PASSES(T)                                                  \
-  template void combine(const Pool&, int64_t, const Combine<T>&);         \
-  template void product(const Pool&, int64_t, const Product<T>&);         \
-  template void eigen(const Pool&, int64_t, const Eigen<T>&);             \
-  template void rotation(const Pool&, int64_t, const Rotation<T>&);       \
-  template void rearrange(const Pool&, int64_t, const Rearrangement<T>&);
-MPMJAX_PASSES(float)
-MPMJAX_PASSES(double)
 
 }  // namespace mpmjax

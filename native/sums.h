@@ -1,13 +1,15 @@
-// The sums for a batch, on all threads.
+// The sums of a batch, on all threads of a pool. Results have the same bits for any number of threads.
+
+#pragma once
 
 #include <algorithm>
 #include <memory>
 #include <vector>
 
 #include "kernels.h"
+#include "share.h"
 
 namespace mpmjax {
-namespace {
 
 // A share of the work is worth a thread's attention from so many visits of nodes on, some twenty microseconds.
 constexpr int64_t kLeastVisits = 1 << 14;
@@ -19,6 +21,23 @@ constexpr int64_t kSamples = 512;
 constexpr double kMostReached = 1.5;
 constexpr int64_t kRound = 64;  // particles of a share are a multiple of this: no two write to one line of a cache
 
+// The nodes of each member cut into parts, one for each thread, and the ranges of nodes that its blocks of particles
+// reach. Where there is one part there are none, unless they are wanted.
+struct Division {
+  int64_t parts, blocks;
+  std::vector<Range> ranges;
+  std::vector<std::vector<int64_t>> cuts;
+};
+
+template <class T, template <class> class Problem>
+const Kernels<T>& kernels_of(const Problem<T>& all) {
+  return *kernels<T>().sums(all.stencils.basis.d, all.stencils.basis.s);
+}
+template <class Problem>
+Kernel<Problem> kernel_of(const Problem& all) {
+  return std::get<Kernel<Problem>>(kernels_of(all).sums);
+}
+
 // How many shares each problem of a batch is cut into, for so many a thread.
 template <class Problem>
 int64_t shares(const Pool& pool, int64_t batch, const Problem& all, int64_t each) {
@@ -28,12 +47,12 @@ int64_t shares(const Pool& pool, int64_t batch, const Problem& all, int64_t each
   return std::max<int64_t>(1, std::min(visits * ((all.columns + 3) / 4) / kLeastVisits, most));
 }
 
-// Calls run(problem, first, last) for all particles of all members.
-template <class Problem, class Run>
-void over_particles(const Pool& pool, int64_t batch, const Problem& all, const Run& run) {
+// Runs the kernel of a problem on all particles of all members.
+template <class Problem>
+void over_particles(const Pool& pool, int64_t batch, const Problem& all) {
   const int64_t particles = all.stencils.particles, each = blocks_of(particles, shares(pool, batch, all, kShares));
   share_parts(pool, batch, particles, std::max<int64_t>(1, blocks_of(each, kRound)) * kRound,
-              [&](int64_t m, int64_t first, int64_t last) { run(member(all, m), first, last); });
+              [&](int64_t m, int64_t first, int64_t last) { kernel_of(all)(member(all, m), first, last); });
 }
 
 // Where the nodes are cut into parts with about as many particles each, by a sample: the k-th part goes from the k-th
@@ -60,20 +79,20 @@ std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, int64_t part
   return result;
 }
 
-// Calls run(problem, first, last) for the nodes of all members.
-template <class Problem, class Run>
-void over_nodes(const Pool& pool, int64_t batch, const Problem& all, const Division& by, const Run& run) {
+// Runs the kernel of a problem on the nodes of all members.
+template <class Problem>
+void over_nodes(const Pool& pool, int64_t batch, const Problem& all, const Division& by) {
   share(pool, batch * by.parts, [&](int64_t i) {
     const std::vector<int64_t>& cuts = by.cuts[i / by.parts];
     const int64_t first = cuts[i % by.parts], last = cuts[i % by.parts + 1];
     Problem task = member(all, i / by.parts);
     task.ranges = by.ranges.empty() ? nullptr : by.ranges.data() + i / by.parts * by.blocks;
-    if (first < last) run(task, first, last);
+    if (first < last) kernel_of(all)(task, first, last);
   });
 }
 
 // How many times the particles of all members are reached by the parts together.
-double reached(const Division& by) {
+inline double reached(const Division& by) {
   int64_t count = 0;
   for (size_t m = 0; m < by.cuts.size() && !by.ranges.empty(); ++m) {
     for (int64_t k = 0; k < by.blocks; ++k) {
@@ -85,9 +104,8 @@ double reached(const Division& by) {
 }
 
 // With `reached` the nodes are marked that particles reach, a block of kChunk each.
-template <class T, class Problem>
-Division divide(const Pool& pool, int64_t batch, const Problem& all, const Kernels<T>& kernels,
-                bool* reached = nullptr) {
+template <class Problem>
+Division divide(const Pool& pool, int64_t batch, const Problem& all, bool* reached = nullptr) {
   const int64_t blocks = blocks_of(all.stencils.particles, kBlock), parts = shares(pool, batch, all, 1);
   Division result = {parts, blocks, {}, {}};
   result.cuts.assign(batch, {0, all.size});
@@ -97,7 +115,7 @@ Division divide(const Pool& pool, int64_t batch, const Problem& all, const Kerne
               [&](int64_t m, int64_t first, int64_t last) {
     const Problem one = member(all, m);
     bool* marks = reached == nullptr ? nullptr : reached + m * blocks_of(all.size);
-    kernels.find_ranges(one.stencils, first, last, result.ranges.data() + m * blocks, all.size, marks);
+    kernels_of(all).find_ranges(one.stencils, first, last, result.ranges.data() + m * blocks, all.size, marks);
     if (first == 0) result.cuts[m] = cut(one.stencils, all.size, parts);
   });
   return result;
@@ -105,80 +123,40 @@ Division divide(const Pool& pool, int64_t batch, const Problem& all, const Kerne
 
 // Sets all nodes of a scatter or an average. Where they are too many for a cache, those that no particle reaches are
 // told.
-template <class T, class Problem>
-void set_nodes(const Pool& pool, int64_t batch, Problem all, const Kernels<T>& kernels,
-               void (*run)(const Problem&, int64_t, int64_t)) {
+template <class T, template <class> class Problem>
+void set_nodes(const Pool& pool, int64_t batch, Problem<T> all) {
   const bool large = all.size * all.columns * static_cast<int64_t>(sizeof(T)) > kCached;
   const std::unique_ptr<bool[]> reached(large ? new bool[batch * blocks_of(all.size)]() : nullptr);
   all.reached = reached.get();
-  over_nodes(pool, batch, all, divide(pool, batch, all, kernels, reached.get()), run);
-}
-
-template <class T, template <class> class Problem>
-const Kernels<T>& kernels_of(const Problem<T>& all) {
-  return *kernels<T>().sums(all.stencils.basis.d, all.stencils.basis.s);
-}
-
-}  // namespace
-
-template <class T>
-void gather(const Pool& pool, int64_t batch, const Gather<T>& all) {
-  over_particles(pool, batch, all, kernels_of(all).gather);
+  over_nodes(pool, batch, all, divide(pool, batch, all, reached.get()));
 }
 
 template <class T>
-void pull(const Pool& pool, int64_t batch, const Pull<T>& all) {
-  over_particles(pool, batch, all, kernels_of(all).pull);
-}
-
+void run(const Pool& pool, int64_t batch, const Gather<T>& all) { over_particles(pool, batch, all); }
 template <class T>
-void scatter(const Pool& pool, int64_t batch, const Scatter<T>& all) {
-  set_nodes(pool, batch, all, kernels_of(all), kernels_of(all).scatter);
-}
-
+void run(const Pool& pool, int64_t batch, const Pull<T>& all) { over_particles(pool, batch, all); }
 template <class T>
-void average(const Pool& pool, int64_t batch, const Average<T>& all) {
-  set_nodes(pool, batch, all, kernels_of(all), kernels_of(all).average);
-}
-
+void run(const Pool& pool, int64_t batch, const G2P<T>& all) { over_particles(pool, batch, all); }
 template <class T>
-void p2g(const Pool& pool, int64_t batch, const P2G<T>& all) {
-  set_nodes(pool, batch, all, kernels_of(all), kernels_of(all).p2g);
-}
-
+void run(const Pool& pool, int64_t batch, const Scatter<T>& all) { set_nodes(pool, batch, all); }
 template <class T>
-void g2p(const Pool& pool, int64_t batch, const G2P<T>& all) {
-  over_particles(pool, batch, all, kernels_of(all).g2p);
-}
-
+void run(const Pool& pool, int64_t batch, const Average<T>& all) { set_nodes(pool, batch, all); }
 template <class T>
-Division divided(const Pool& pool, int64_t batch, const Resist<T>& all) {
-  return divide(pool, batch, all, kernels_of(all));
-}
+void run(const Pool& pool, int64_t batch, const P2G<T>& all) { set_nodes(pool, batch, all); }
 
+// A resistance with a division found before, which its particles' places alone decide.
 template <class T>
-void resist(const Pool& pool, int64_t batch, const Resist<T>& all, const Division& division) {
-  if (reached(division) <= kMostReached) return over_nodes(pool, batch, all, division, kernels_of(all).resist);
+void run(const Pool& pool, int64_t batch, Resist<T> all, const Division& division) {
+  if (reached(division) <= kMostReached) return over_nodes(pool, batch, all, division);
   // Each particle once, and then a scatter: the parts would do most particles several times.
   const std::unique_ptr<T[]> stored(new T[batch * all.columns * all.columns * all.stencils.particles]);
-  Resist<T> first = all;
-  first.gradients = stored.get();
   const ParticleValues<T> values = {nullptr, stored.get(), all.columns};
   const Scatter<T> rest = {all.stencils, values, all.nodes, nullptr, nullptr, all.size, all.columns, all.wanted};
-  over_particles(pool, batch, first, kernels_of(all).resist_particles);
-  over_nodes(pool, batch, rest, division, kernels_of(all).scatter);
+  all.gradients = stored.get();
+  over_particles(pool, batch, all);
+  over_nodes(pool, batch, rest, division);
 }
-
-#define MPMJAX_SUMS(T)                                                        \
-  template void gather(const Pool&, int64_t, const Gather<T>&);         \
-  template void scatter(const Pool&, int64_t, const Scatter<T>&);       \
-  template void average(const Pool&, int64_t, const Average<T>&);       \
-  template void p2g(const Pool&, int64_t, const P2G<T>&);               \
-  template void g2p(const Pool&, int64_t, const G2P<T>&);               \
-  template void pull(const Pool&, int64_t, const Pull<T>&);             \
-  template Division divided(const Pool&, int64_t, const Resist<T>&);    \
-  template void resist(const Pool&, int64_t, const Resist<T>&, const Division&);
-MPMJAX_SUMS(float)
-MPMJAX_SUMS(double)
+template <class T>
+void run(const Pool& pool, int64_t batch, const Resist<T>& all) { run(pool, batch, all, divide(pool, batch, all)); }
 
 }  // namespace mpmjax
