@@ -639,3 +639,14 @@ def test_a_face_far_behind_a_contact_plane_is_held_whatever_is_beside_it():
     scene = mpm.Scene(grid, mpm.NeoHookean(1e4, 0.3), boundary=mpm.ContactPlane(1, 0.0))
     end, _ = mpm.step(scene, mpm.prepare(scene, falling), 0.0, 1e-3)
     assert end.v[deep, 1] > -0.01
+
+
+def test_a_collider_that_pushes_is_said_to_move_nodes():
+    """So that in explicit steps a plane beside it looks for what is shut, and does not take it from velocities without
+    the push."""
+    nodes = jnp.zeros((3, 2))
+    collider = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (1.0, 0.3)))
+    conditions = collider.conditions(nodes, 0.1, 0.0, 1e-3, reference=False)
+    assert conditions.holds
+    assert not conditions.moves
+    assert not conditions.fixed.any()

@@ -246,8 +246,8 @@ class SeparatingCollider(AbstractCollider):
     pushes: ClassVar[bool] = True
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """None on nodes: it acts on faces."""
-        return no_conditions(nodes)
+        """None on nodes, which its push on faces moves all the same: with it no contact is known at the start."""
+        return replace(no_conditions(nodes), holds=True, moves=self.motion is not None)
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         motion = self.moved_by(x.dtype)
