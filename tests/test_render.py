@@ -291,6 +291,22 @@ def test_colours_by_what_a_law_remembers_and_by_material():
     np.testing.assert_allclose(tinted[16], bar.to_rgba(1.0)[:3])
 
 
+def test_materials_are_named_where_they_are_told_apart(monkeypatch):
+    """By colours of their own, not by a bar of numbers between 1 and 2."""
+    figures, law = [], LAWS["neo_hookean"]
+    monkeypatch.setattr(mpmjax.viz._render, "save_figure", lambda figure, *_: figures.append(figure))
+    run = still_run(np.zeros((1, 2, 2)))
+    scene = mpm.Scene(run.scene.grid, {"rubber": law, "gel": law})
+    F = run.frames.deformations[0]
+    frames = dataclasses.replace(run.frames, deformations=(F[:, :1], F[:, 1:]), histories=(None, None))
+    halves = {"counts": (1, 1), "deformations": (F[0, :1], F[0, 1:]), "histories": (None, None)}
+    final = dataclasses.replace(run.final, **halves)
+    mpm.render(dataclasses.replace(run, scene=scene, frames=frames, final=final), "never.png", colour="material")
+    (axes,) = figures[0].axes
+    assert not axes.child_axes
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == list(scene.titles)
+
+
 def test_what_cannot_be_drawn_is_refused(tmp_path):
     run = still_run(np.zeros((1, 1, 3)))
     path = tmp_path / "a.png"

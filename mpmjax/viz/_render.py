@@ -22,7 +22,6 @@ COLOURS: dict[str, tuple[str, Callable[[Scene, Particles], Any]]] = {
 }
 """The quantities that can colour particles: a label, and a value for each particle."""
 _SMOOTHED = ("pressure", "von_mises")  # they oscillate from particle to particle
-_COUNTED = ("material", "particle")  # numbers, of which all are shown
 
 SNOW, OCHRE, STEEL, MOSS = (0.91, 0.93, 0.96), (0.82, 0.55, 0.33), (0.36, 0.5, 0.66), (0.45, 0.62, 0.42)
 STONE = (0.55, 0.54, 0.52)  # the colour of walls and colliders
@@ -55,10 +54,10 @@ def render(
     Args:
         run: a run with frames.
         path: the picture to write; its suffix says of which kind.
-        colour: "speed", "J", "energy", "pressure", "von_mises", "density", "material", "mass", "volume", "particle",
-            or the name of what a law remembers, such as snow's "plastic_volume"; None or "none" to see the shape
-            alone, materials in colours of their own. Pressure and von Mises stress are averages over the particles
-            around (`analysis.smoothed`).
+        colour: "speed", "J", "energy", "pressure", "von_mises", "density", "mass", "volume", "particle", or the name
+            of what a law remembers, such as snow's "plastic_volume"; "material", "none" or None for materials in
+            colours of their own, named where there are several. Pressure and von Mises stress are averages over the
+            particles around (`analysis.smoothed`).
         frame: which frame a still shows; counts from the end if negative. Default: the last.
         view: in three dimensions, azimuth and elevation of the eye [degrees]. At azimuth 0 the first horizontal axis
             points to the right; the elevation is above 0 and at most 90.
@@ -72,7 +71,7 @@ def render(
     path = Path(path)
     suffixes = (".png", ".pdf", ".svg", ".gif", ".mp4")
     require(path.suffix in suffixes, f"A picture's name must end in one of {', '.join(suffixes)}, got {path.name!r}.")
-    colour = None if colour == "none" else colour
+    colour = None if colour in ("none", "material") else colour
     require(len(run) > 0, "The run has no frames to draw: pass save_every to simulate.")
     quantities = COLOURS | {
         name: (name.replace("_", " "), partial(_remembered, name)) for name, *_ in history_arrays(run.final)
@@ -104,7 +103,7 @@ def render(
     bar = None
     if colour is not None and there.any():
         least, most = np.nanmin(values), np.nanmax(values)
-        low, high = (least, most) if colour in _COUNTED else np.nanpercentile(values, (1, 99))
+        low, high = (least, most) if colour == "particle" else np.nanpercentile(values, (1, 99))
         low, high = (low, high) if low < high else (least, most)
         colours: Any = colormaps["viridis"].copy()
         colours.colorbar_extend = ("neither", "max", "min", "both")[2 * bool(least < low) + bool(most > high)]
