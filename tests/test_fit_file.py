@@ -290,6 +290,11 @@ FAULTS = {
     "no number": ('"scene.material.youngs_modulus"', '"scene.material"', r"must be a number"),
     "derived": ("material.youngs_modulus", "material.lame_lambda", r"follows from others"),
     "no root": ('"scene.material.youngs_modulus"', '"material.youngs_modulus"', r"begins with scene"),
+    "several": (
+        '"scene.material.youngs_modulus"',
+        '"scene.boundary.position"',
+        r"no 'position' there: name one of several before it, by its number from 0\.",
+    ),
     "no report": ("material.shear_modulus", "material.bulk", r"no 'bulk'"),
     "kind": ('kind = "Tracks"', 'kind = "Traces"', r"kind must be one of"),
     "unknown key": ("report =", "reports =", r"unknown key"),

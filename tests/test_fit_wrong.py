@@ -375,12 +375,13 @@ def test_two_numbers_that_cannot_be_parted_are_named_after_the_first_jacobian():
     """E and ν of a bar in one dimension, whose motion sees one modulus: before the first iteration, and once."""
     times, x, which = tracks()
     lines, guess = [], stiffness(1e5) | {"nu": RATIO}
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings():
         warnings.simplefilter("always")
+        warnings.showwarning = lambda message, *_: lines.append(str(message))
         lm = mpm.fitting.LevenbergMarquardt(max_steps=2)
         seen = experiment(mpm.Tracks(times, x, which=which, sigma=NOISE))
         mpm.fit(seen, guess, starts=1, discretisation=False, optimiser=lm, progress=lines.append)
-    (named,) = (k for k, line in enumerate(lines) if line.startswith("at the first guess, E and nu: "))
+    (named,) = (k for k, line in enumerate(lines) if "E and nu: " in line)
     (first,) = (k for k, line in enumerate(lines) if line.startswith("   0  misfit"))
     assert named < first
-    assert sum("E and nu: " in str(w.message) for w in caught) == 1
+    assert lines[named].startswith("At the first guess, ")

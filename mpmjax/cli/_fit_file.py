@@ -145,7 +145,8 @@ def leaf_of(path: str, experiment: Experiment) -> Any:
         try:
             value = value[int(name)] if name.isdecimal() else getattr(value, name)
         except (AttributeError, IndexError, TypeError):
-            raise ValueError(f"[fit] names {path!r}, but there is no {name!r} there.") from None
+            one = ": name one of several before it, by its number from 0" if isinstance(value, tuple) else ""
+            raise ValueError(f"[fit] names {path!r}, but there is no {name!r} there{one}.") from None
     return value
 
 

@@ -103,7 +103,7 @@ def fit(
 
         def iterated(problem: FitProblem, search: Search) -> None:
             if search.history[-1].number == 0:
-                _see(problem, search.seen, alike, say)
+                _see(problem, search.seen, alike)
             record(problem, search)
 
         def enough(other: Search) -> bool:
@@ -143,7 +143,7 @@ def fit(
     return result
 
 
-def _see(problem: FitProblem, seen: Evaluation, alike: set[str], say: Callable[[str], None]) -> None:
+def _see(problem: FitProblem, seen: Evaluation, alike: set[str]) -> None:
     """Refuse parameters that the data do not see at the first guess; warn, once, of those not seen apart, `alike`."""
     require_influence(problem, seen)
     if seen.jacobian is None or alike:
@@ -152,7 +152,6 @@ def _see(problem: FitProblem, seen: Evaluation, alike: set[str], say: Callable[[
     for text in seen_together(problem.labels, errors, problem.logarithmic):
         alike.add(text.split(":")[0])
         warn(f"At the first guess, {text}")
-        say(f"at the first guess, {text}")
 
 
 def _warn_of(result: FitResult, end: Search, *, moves: bool, but: set[str]) -> None:
