@@ -62,6 +62,12 @@ def test_every_field_of_a_public_class_is_explained(name):
             assert not {f for f in fields if f[0] != "_"} - set().union(*map(explained, whole)), cls
 
 
+def test_help_explains_what_a_run_holds():
+    """Comments are for the pages and the source; `help(mpm.Run)` shows the docstring."""
+    fields = mpmjax.Run.__dataclass_fields__
+    assert not {f for f in fields if f"\n        {f}: " not in mpmjax.Run.__doc__}
+
+
 PACKAGE = Path(mpmjax.__file__).parent
 FILES = {path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py"))}
 NAMELESS = {"found", "own", "known", "given", "said"}

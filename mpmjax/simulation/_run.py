@@ -136,35 +136,49 @@ class Forces(NamedTuple):
 
 
 class Run(eqx.Module):
-    """A simulation's outcome. A pytree: it can be returned from `jax.jit`, `jax.vmap` and differentiated."""
+    """A simulation's outcome. A pytree: it can be returned from `jax.jit`, `jax.vmap` and differentiated.
 
-    scene: Scene  # the scene, with numbers as arrays of the particles' precision
-    method: AbstractIntegrator  # the integrator, likewise
-    dt: Scalar  # Δt [s]
-    steps: Float[Array, "*f"]  # step number of each saved frame, shape (f,)
-    frames: State | None  # the saved states, with a leading axis f; None where nothing or only observations were saved
-    observed: Any  # the result of `observe` for each frame, with a leading axis f
-    final: Particles  # the particles at the end
-    final_step: Float[Array, ""]  # step number at the end
-    statistics: RunStatistics  # solver and contact statistics, and the first fault
+    Attributes:
+        scene: the scene, with numbers as arrays of the particles' precision.
+        method: the integrator, likewise.
+        dt: Δt [s].
+        steps: step number of each saved frame, shape (f,).
+        frames: the saved states, with a leading axis f; None where nothing or only observations were saved.
+        observed: the result of `observe` for each frame, with a leading axis f.
+        final: the particles at the end.
+        final_step: step number at the end.
+        statistics: solver and contact statistics, and the first fault.
+        report: zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not
+            converge, zero if all did. None of a run from a file.
+        collider_impulse: linear and angular impulse on the scene's colliders from the run's start to each saved frame,
+            with a leading axis f; None without colliders, or where nothing was saved. The difference between two
+            frames, over the time between them, is the mean force and torque of these steps (see `forces`, which says
+            at what time).
+        final_collider_impulse: that on the colliders to the end; None without colliders.
+        boundary_impulse: as `collider_impulse`, on each of the scene's boundaries (see `boundary_forces`); None unless
+            the scene has `boundary_forces`, or where nothing was saved.
+        final_boundary_impulse: that on the boundaries to the end; None unless the scene has `boundary_forces`.
+        memory: the memory of the run's control at each saved frame, with a leading axis f; of a run from a file its
+            arrays.
+        final_memory: the memory of the control at the end, with which another run goes on.
+    """
+
+    scene: Scene
+    method: AbstractIntegrator
+    dt: Scalar
+    steps: Float[Array, "*f"]
+    frames: State | None
+    observed: Any
+    final: Particles
+    final_step: Float[Array, ""]
+    statistics: RunStatistics
     report: Float[Array, "..."] | None = None
-    """Zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not converge,
-    zero if all did. None of a run from a file."""
     collider_impulse: Impulses | None = None
-    """Linear and angular impulse on the scene's colliders from the run's start to each saved frame, with a leading
-    axis f; None without colliders, or where nothing was saved. The difference between two frames, over the time
-    between them, is the mean force and torque of these steps (see `forces`, which says at what time)."""
     final_collider_impulse: Impulses | None = None
-    """Linear and angular impulse on the colliders to the end; None without colliders."""
     boundary_impulse: Impulses | None = None
-    """As `collider_impulse`, on each of the scene's boundaries (see `boundary_forces`); None unless the scene has
-    `boundary_forces`, or where nothing was saved."""
     final_boundary_impulse: Impulses | None = None
-    """Impulse on each of the scene's boundaries from the run's start to its end; None unless the scene has
-    `boundary_forces`."""
     memory: Any = None
-    """The memory of the run's control at each saved frame, with a leading axis f; of a run from a file its arrays."""
-    final_memory: Any = None  # the memory of the control at the end, with which another run goes on
+    final_memory: Any = None
 
     @property
     def times(self) -> Float[Array, "*f"]:
