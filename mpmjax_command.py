@@ -1,15 +1,13 @@
-"""The shell's `mpmjax`: its options, and what is refused before a room of the package is imported.
+"""The shell's `mpmjax`: its options, and what is refused before a room is imported, which takes a second."""
 
-It imports no room until it needs one, which takes a second: who asks for help or errs waits less, and meanwhile Ctrl-C
-ends the command as quietly as SIGTERM does, not with a traceback of what was being imported.
-"""
-
+import hashlib
 import importlib
 import importlib.util
 import itertools
 import json
 import math
 import os
+import platform
 import re
 import signal
 import sys
@@ -17,7 +15,7 @@ import tomllib
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -35,7 +33,8 @@ def main() -> None:
     """Entry point of the `mpmjax` command."""
     global _handles_signals
     _handles_signals = True
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    _keep_programs()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # quiet too while that goes on
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     app()
 
@@ -71,6 +70,18 @@ def _package(imports: Sequence[str] | None = None) -> Iterator[Any]:
                 where = "" if placed else f" ({place.filename}, line {place.lineno})"
                 raise ValueError(f"--import {name}: {type(error).__name__}: {error}{where}") from None
         yield cli
+
+
+def _keep_programs() -> None:
+    """Have JAX keep what it compiles for the next command on such a processor, and not fill pages on other ones."""
+    with suppress(OSError):
+        cpu = Path("/proc/cpuinfo").read_bytes() if Path("/proc/cpuinfo").exists() else b""
+        kind = b"".join(re.findall(rb"(?im)^(?:flags|features).*", cpu)[:1]) or platform.processor().encode()
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+        folder = caches / "mpmjax" / hashlib.sha256(kind).hexdigest()[:8]
+        folder.mkdir(parents=True, exist_ok=True)
+        settings = {"JAX_COMPILATION_CACHE_DIR": str(folder), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        os.environ.update({**settings, "TF_CPP_MIN_LOG_LEVEL": "3", **os.environ})  # the user's own hold
 
 
 def _require(condition: Any, message: str) -> None:

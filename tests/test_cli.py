@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -159,6 +160,17 @@ print(sorted({{"jax", "numpy", "h5py", "mpmjax.cli"}} & set(sys.modules)))
         assert says in ran.stderr
     assert ran.stderr.count("mpmjax: ") == sum(map(bool, refusals.values()))
     assert f"mpmjax {mpm.__version__}" in ran.stdout
+
+
+@pytest.mark.thorough
+def test_the_shell_keeps_compiled_programs(tmp_path):
+    """For the next command on such a processor."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    command = [sys.executable, "-m", "mpmjax", "run", "scene.toml", "--quiet"]
+    places = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    ran = subprocess.run(command, cwd=tmp_path, env=places, capture_output=True, text=True, check=True)
+    assert ran.stderr == ""
+    assert list(tmp_path.glob("mpmjax/*/jit_integrate-*"))
 
 
 def test_help_names_the_colours():

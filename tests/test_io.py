@@ -327,6 +327,16 @@ def test_the_file_says_what_it_holds(tmp_path):
 # A run recorded as it goes -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("count", [None, 2])
+def test_the_program_of_a_run_calls_no_host(count):
+    """One that does is not kept by JAX's cache, so that each process compiles it anew."""
+    scene, particles = jelly()
+    problem = Problem(scene, prepare(scene, particles), jnp.asarray(5e-3), mpm.Explicit(), start=jnp.zeros(()))
+    arguments = {"until": np.asarray(np.inf), "max_steps": 3}
+    number = None if count is None else jnp.asarray(float(count))
+    assert "callback" not in integrate.lower(problem, initial_state(problem), number, **arguments).as_text()
+
+
 @pytest.mark.parametrize("stepper", **ids(STEPPERS, "explicit"))
 @pytest.mark.parametrize("dtype", **ids(DTYPES, "float64", ()))
 @pytest.mark.parametrize("law", [None, *thorough(mpm.Snow(1e4, critical_stretch=1e-4))], ids=["elastic", "snow"])

@@ -31,6 +31,7 @@ from mpmjax.simulation._diffrax import (
     Problem,
     RolloutState,
     StepSolver,
+    UnitSteps,
     checkpointed,
     faulty_particles,
     gravest,
@@ -256,7 +257,7 @@ def integrate(
     its last time is then a constant to XLA, and not a program of two thousand operations."""
     scene, particles, start, save_every = problem.scene, problem.particles, problem.start, problem.save_every
     dtype = particles.x.dtype
-    zero, one, all_steps = (np.asarray(n, dtype) for n in (0, 1, max_steps))
+    zero, all_steps = (np.asarray(n, dtype) for n in (0, max_steps))
     until, slot = (jnp.asarray(a, dtype) for a in (until, problem.slot))
     stencil = scene.stencil(particles) if scene.total else None
     problem = replace(problem, stencil=stencil, until=until, slot=slot)
@@ -286,10 +287,11 @@ def integrate(
         StepSolver(watch),
         t0=zero,
         t1=all_steps if count is None else count,
-        dt0=one,
+        dt0=None,
         y0=state,
         args=problem,
         saveat=diffrax.SaveAt(subs=subs, solver_state=True),
+        stepsize_controller=UnitSteps(),
         adjoint=adjoint,
         max_steps=max_steps,
         throw=False,
