@@ -10,6 +10,7 @@ import pytest
 from helpers import assert_close, assert_files_hold, ids, thorough
 
 import mpmjax as mpm
+from mpmjax.boundary import constrain
 from mpmjax.boundary._body_contact import Coupling, Patch
 from mpmjax.checks import canonical
 from mpmjax.potential import Displacement
@@ -229,9 +230,30 @@ def test_half_of_two_bodies_is_pushed_as_the_whole():
     assert_close(found[1], found[0], 0, 3e-4 * abs(found[0]).max())
 
 
+@eqx.filter_jit
+def rubbed(scene, particles, v):
+    """The contact of two bodies, the change of the nodes' velocity v by friction, and the components that are free."""
+    nodes = start_nodes(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
+    (contact,) = nodes.contacts
+    held = constrain(nodes, (contact.gap < 0,))
+    return contact, contact.friction(held, held.active[0], jnp.zeros_like(v))(v), held.nodes.projection.free
+
+
 def test_bodies_that_touch_do_so_beside_a_clamp_too():
-    """The gap is that beside a symmetry plane: where bodies are is mirrored alike, only velocities are not."""
-    gaps = [contact_of(*stacked(boundary=plane(0, 0.0)))[0].gap for plane in (mpm.SymmetryPlane, mpm.ClampPlane)]
+    """The gap is that beside a symmetry plane: where bodies are is mirrored alike, only velocities are not. Friction
+    changes neither what the plane holds nor what is along the normal."""
+    gaps = []
+    for plane in (mpm.SymmetryPlane, mpm.ClampPlane):
+        scene, particles = stacked(gap=-0.1, boundary=plane(0, 0.0), friction=1.0)
+        scene = canonical(scene, particles.x.dtype)
+        v = jnp.asarray(np.random.default_rng(4).normal(size=(scene.grid.size, 2)))
+        contact, change, free = rubbed(scene, mpm.prepare(scene, particles), v)
+        gaps.append(contact.gap)
+        assert abs(change[free]).max() > 0.02
+        assert not change[~free].any()
+        both = change.reshape(2, *contact.normal.shape)
+        across = jnp.where(free.all(axis=1).reshape(2, -1), (both * contact.normal).sum(axis=2), 0)
+        assert abs(across).max() < 1e-12
     np.testing.assert_array_equal(*gaps)
 
 

@@ -4,6 +4,7 @@ part."""
 import warnings
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from mpmjax.fitting._discretisation import CoarseGrid, look_at_coarse_grid, unex
 from mpmjax.fitting._estimate import shape_of, strongest_mode
 from mpmjax.fitting._evaluation import Evaluation
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._result import Minimum, fit_result
+from mpmjax.fitting._result import Minimum, _judged, fit_result
 from mpmjax.fitting._search import Search
 from mpmjax.verification import StandingWave, discretise
 
@@ -167,6 +168,22 @@ def test_correlated_numbers_are_worth_what_theory_says():
     assert sum(kind != "" for _, kind in white) < 5
     common = rng.normal(size=(40, 1)) + 0.1 * rng.normal(size=(40, 20))
     assert shape_of(common)[0] == pytest.approx(20, rel=0.2)
+
+
+@pytest.mark.parametrize("weight", [1.0, 4.0])
+def test_what_a_misfit_adds_to_errors_goes_with_the_weight_of_its_squares(weight):
+    """Sequences that err alike, by their strongest mode; one whose neighbours do, by what it is worth."""
+    rng = np.random.default_rng(2)
+    common = rng.normal(size=(40, 1)) + 0.1 * rng.normal(size=(40, 20))
+    for r, wanted in ((common, strongest_mode(common)), (autoregressive(rng, 60, 0.9)[:, None], None)):
+        seen = mpm.Series(np.arange(1.0, len(r) + 1), 0 * r, spread, weight=weight)
+        problem = SimpleNamespace(observations=[seen], rows=[slice(0, r.size)], dtype=np.float64)
+        weighed, J = np.sqrt(weight) * r.reshape(-1), np.sqrt(weight) * np.ones((r.size, 1))
+        _, _, (_, wider, _) = _judged(problem, 0, [(0.1, 1.0, r.size - 1.0)], weighed, J, weighed)
+        if wanted is None:
+            wanted = shape_of(r)[0] * min((r**2).sum() / (r.size - 1), 1)
+        assert wanted > 3
+        assert wider == pytest.approx(weight * wanted)
 
 
 def test_misfit_that_is_like_the_change_on_twice_the_spacing_is_explained():

@@ -224,6 +224,44 @@ def test_what_cannot_solve_is_refused_with_what_can():
         mpm.implicit.ConjugateResidual().init(identity, {"preconditioner": identity})
 
 
+class Missing(MinimalResidual):
+    """Misses the solution by a share, so that its residual is that share of the right-hand side, and says something."""
+
+    share: float = 0.0
+    says: bool = True
+
+    def compute(self, state, vector, options):
+        x = jnp.linalg.solve(state.as_matrix(), vector.reshape(-1)).reshape(vector.shape)
+        said = lx.RESULTS.where(self.says, lx.RESULTS.successful, lx.RESULTS.stagnation)
+        return (1 + self.share) * x, said, {}
+
+
+def test_another_solver_has_converged_if_it_says_so_and_its_residual_does():
+    """Nearly within ten times its tolerance, whatever it says; and so Newton's method after its last step."""
+    scene, particles = block(1, material=LAWS["neo_hookean"])
+    particles = mpm.prepare(scene, particles)  # stretched by a half, and at rest
+    particles = dataclasses.replace(particles, deformations=(1.5 * particles.F,))
+
+    def ended(method):
+        solve = mpm.step(scene, particles, 0.0, DT, method=method)[1].solve
+        return bool(solve.converged), bool(solve.nearly_converged), float(solve.residual)
+
+    for times, says, wanted in (
+        (0.9, True, (True, False)),
+        (0.9, False, (False, True)),
+        (1.1, True, (False, True)),
+        (9.9, True, (False, True)),
+        (10.1, True, (False, False)),
+    ):
+        *verdict, residual = ended(mpm.SemiImplicit(solver=Missing(1e-6, times * 1e-6, says)))
+        assert tuple(verdict) == wanted
+        assert residual == pytest.approx(times * 1e-6)
+    newton = lambda rtol: ended(mpm.BackwardEuler(mpm.implicit.Newton(rtol=rtol, max_steps=1)))  # noqa: E731
+    left = newton(1e-9)[2]
+    for times, wanted in ((0.9, (True, False)), (1.1, (False, True)), (9.9, (False, True)), (10.1, (False, False))):
+        assert newton(left / times)[:2] == wanted
+
+
 @pytest.mark.thorough
 def test_a_solver_that_does_not_solve_is_found_out():
     """One that returns its right-hand side and calls it a solution: the residual is computed, and the run raises."""

@@ -31,7 +31,7 @@ FEATURES = {
     "sticky collider": {"boundary": mpm.StickyCollider(FOOT)},
     "slip collider": {"boundary": mpm.SlipCollider(UNDER, STAY)},
     "separating collider": {"boundary": mpm.SeparatingCollider(UNDER, friction=0.1)},
-    "rigid part": {"boundary": mpm.RigidPart(FOOT)},
+    "rigid part": {"boundary": mpm.RigidPart(FOOT), "description": mpm.TotalLagrangian()},
     "boundary forces": {"boundary": mpm.SlipBox((0.0, -np.inf), HIGH), "boundary_forces": True},
     "total": {"description": mpm.TotalLagrangian()},
     "linear kernel": {"kernel": mpm.BSpline(1)},
