@@ -160,15 +160,16 @@ def test_a_run_that_leads_far_from_zero_tells_of_its_rounding():
 
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_two_sets_at_one_place_are_told_of(d):
-    """And none of sets that touch, whatever their lattices: round ones in a box's corner, coarse beside fine."""
+    """However little they overlap, and none of sets that touch, whatever their lattices: round ones in a box's corner,
+    coarse beside fine."""
     grid = mpm.Grid((24,) * d, 0.1, origin=(-4,) * d)
-    half, whole, law = (0.52,) + (1.0,) * (d - 1), (1.0,) * d, LAWS["neo_hookean"]
+    half, whole, law = (0.54,) + (1.0,) * (d - 1), (1.0,) * d, LAWS["neo_hookean"]
 
     def filled(lower, upper, each):
         return mpm.fill(mpm.Box(lower, upper), grid, density=1e3, particles_per_cell=each**d)
 
-    left, right = filled((0.0,) * d, half, 2), filled((0.52,) + (0.0,) * (d - 1), whole, 3)
-    over = filled((0.4,) + (0.0,) * (d - 1), whole, 2)
+    left, right = filled((0.0,) * d, half, 2), filled((0.54,) + (0.0,) * (d - 1), whole, 3)
+    over = filled((0.46,) + (0.0,) * (d - 1), whole, 2)
     ball = mpm.fill(mpm.Ball((0.33,) * d, 0.31), grid, density=1e3)
     for sets, told in (((left, right), False), ((left, over), True), ((ball,), False), ((ball, ball), True)):
         with warnings.catch_warnings(record=True) as said:

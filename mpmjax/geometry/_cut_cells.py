@@ -149,7 +149,8 @@ def surface_pieces(
     """The surface of a region between two corners, by marching simplices: each cube of a lattice is divided into d!
     simplices (H. W. Kuhn, IBM J. Res. Dev. 4 (1960) 518, doi 10.1147/rd.45.0518). Each of the region's `sides` is taken
     as linear in each simplex and clipped by the others, and by those of `within`. Second order in the spacing; exact of
-    boxes, and of the parts of them in a box.
+    boxes, and of the parts of them in a box; of first order at edges of a `Complement` and where parts of a `Union`
+    meet, which are cut off.
 
     Args:
         region: whose surface.

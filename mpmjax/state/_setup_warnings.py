@@ -5,6 +5,7 @@ still reach is not.
 """
 
 import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -64,12 +65,14 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
         elif not np.asarray(mask)[slice(None) if may_meet else _in_stencils(scene.kernel, grid, places)].any():
             where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
             warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")
-    filled = _filled(x, volume.astype(float), 2 * max(float(grid.spacing), float(volume.max()) ** (1 / grid.dim)))
-    if filled is not None and filled[0].max() >= _CROWDED:
-        warn(
-            f"Near {filled[1]} m particles take {filled[0].max():.2g} times the space that there is: where two sets "
-            "fill the same place there is twice the mass. Leave one of them out there."
-        )
+    width = 2 * max(float(grid.spacing), float(volume.max()) ** (1 / grid.dim))
+    for filled in _filled(x, volume.astype(float), width):
+        if filled[0].max() >= _CROWDED:
+            warn(
+                f"Near {filled[1]} m particles take {filled[0].max():.2g} times the space that there is: where two "
+                "sets fill the same place there is twice the mass. Leave one of them out there."
+            )
+            break
     for number, group in enumerate(particles.groups, 1):
         rows = slice(*np.searchsorted(there, (group.rows.start, group.rows.stop)))
         which = "The body" if particles.counts is None else f"The body of material {number}"
@@ -173,10 +176,9 @@ def warn_of_crowding(scene: Scene, particles: Particles) -> None:
     if not undeformed.any():
         return
     side = float(undeformed.max()) ** (1 / particles.dim)
-    for offset in (0.0, 0.5):  # a layer between two rows of nodes shows less
-        filled = _filled(np.asarray(particles.x), volume, max(float(scene.grid.spacing), 2 * side), offset)
-        beyond = 0.0 if filled is None else np.maximum(filled[0] - _CROWDED, 0).sum() / filled[0].sum()
-        if filled is not None and beyond > _MOST_BEYOND:
+    for filled in _filled(np.asarray(particles.x), volume, max(float(scene.grid.spacing), 2 * side)):
+        beyond = np.maximum(filled[0] - _CROWDED, 0).sum() / filled[0].sum()
+        if beyond > _MOST_BEYOND:
             warn(
                 f"At the end particles take up to {filled[0].max():.2g} times the space that there is, most near "
                 f"{filled[1]} m, and {100 * beyond:.2g} % of their volume is too much where it lies: levels and "
@@ -229,23 +231,22 @@ def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Any) -> Any:
     return volume ** (1 / grid.dim) / 4 if boundary.pushes else 0 * volume - ON_THE_WALL * grid.spacing
 
 
-def _filled(
-    x: np.ndarray, volume: np.ndarray, width: float, offset: float = 0.0
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """How many times its space each node of a lattice holds, by linear weights, which those of one body fill to a
-    tenth, and where the fullest is [m]; None where that is too much to look for. The lattice has a spacing `width` [m],
-    and its nodes are `offset` spacings before whole numbers of it."""
-    scaled = np.asarray(x, float) / width + offset
-    d, index = scaled.shape[1], np.floor(scaled).astype(np.int64)
-    first, share = index.min(axis=0), scaled - index
-    index = index - first
-    shape = index.max(axis=0) + 2
-    if shape.prod() > _MOST_CELLS:
-        return None
-    share_filled = np.zeros(shape.prod())
-    for corner in itertools.product((0, 1), repeat=d):
-        weight = np.where(corner, share, 1 - share).prod(axis=1)
-        node = np.ravel_multi_index(tuple((index + corner).T), shape)
-        share_filled += np.bincount(node, weight * volume, share_filled.size)
-    fullest = np.asarray(np.unravel_index(int(share_filled.argmax()), shape))
-    return share_filled / width**d, (fullest + first - offset) * width
+def _filled(x: np.ndarray, volume: np.ndarray, width: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """How many times its space each node of a lattice of spacing `width` [m] holds, by linear weights, which those of
+    one body fill to a tenth, and where the fullest is [m]: of two lattices, as a layer between two rows of nodes shows
+    less; of none where that is too much to look for."""
+    for offset in (0.0, 0.5):
+        scaled = np.asarray(x, float) / width + offset
+        d, index = scaled.shape[1], np.floor(scaled).astype(np.int64)
+        first, share = index.min(axis=0), scaled - index
+        index = index - first
+        shape = index.max(axis=0) + 2
+        if shape.prod() > _MOST_CELLS:
+            return
+        share_filled = np.zeros(shape.prod())
+        for corner in itertools.product((0, 1), repeat=d):
+            weight = np.where(corner, share, 1 - share).prod(axis=1)
+            node = np.ravel_multi_index(tuple((index + corner).T), shape)
+            share_filled += np.bincount(node, weight * volume, share_filled.size)
+        fullest = np.asarray(np.unravel_index(int(share_filled.argmax()), shape))
+        yield share_filled / width**d, (fullest + first - offset) * width

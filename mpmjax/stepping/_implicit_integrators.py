@@ -289,6 +289,7 @@ class TRBDF2(AbstractImplicitIntegrator):
     from what sticks and a body at rest stays there. Over the step it takes at most μ times the push of the step.
 
     *When it breaks*: as `ImplicitMidpoint`. Near ρ∞ = 1 what a wall's friction can hold oscillates as its push does.
+    What a moving `SeparatingCollider` pushes stays behind it by its way in a step: that force is half a step late.
 
     Args:
         rho: ρ∞, from 0 to 1.
