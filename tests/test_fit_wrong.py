@@ -194,7 +194,7 @@ def test_the_strongest_mode_is_that_of_a_discrepancy_and_none_of_noise():
     assert sum(strongest_mode(rows) > 0 for rows in white) <= 2
     hidden = [0.5 * mode + rows for rows in white[:40]]
     assert sum(improbable((rows**2).sum(), rows.size) for rows in hidden) < 20
-    assert sum(strongest_mode(rows) > 0 for rows in hidden) > 35
+    assert sum(strongest_mode(rows) > 0 for rows in hidden) > 30
     assert strongest_mode(5 * mode + white[0]) == pytest.approx(25 * (mode**2).sum(), rel=0.05)
 
 
