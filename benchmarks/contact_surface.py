@@ -8,7 +8,7 @@ as it was, and of contact at the particles' faces, as it is.
 A bar, or a square block, falls on a plain wall that lies anywhere between nodes. Its mean velocity tells
 when the wall has given 2 and 98 % of its impulse; by the exact solution of the bar, the time between is 0.96 of 2L/c,
 and the first comes 0.04 L/c after its face is at the wall. The reference of the block is the same block at four times
-the resolution. A ball, in its section, is thrown at a plane and compared with Hertz's contact.
+the resolution. A ball, in its section, is thrown at a plane and compared with Hertz's contact and finite elements.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from peers.finite_elements import Mesh, simulate as by_elements
 
 import mpmjax as mpm
 from mpmjax._types import Array
@@ -203,8 +204,7 @@ def ball(cells: int, wall: str, *, at=0.0, gap=0.6, nu=0.3, depth=0.05, fitted=T
     the time of contact, and the time between 2 and 98 % of the impulse, over Hertz's."""
     dx, law = 1.0 / cells, mpm.NeoHookean(1.0, nu)
     grid = mpm.Grid((int(1.15 * cells) + 5, int(2.3 * cells) + 10), dx, origin=(-2, -4), axisymmetric=True)
-    mass, stiffness = 4 / 3 * np.pi, 4 / 3 / (1 - nu**2)
-    v0 = np.sqrt(4 / 5 * stiffness * depth**2.5 / mass)
+    v0, lasts = _hertz(nu, depth)
     whole = mpm.Ball((0.0, 1 + (at + gap) * dx), 1.0)
     body = mpm.fill(whole, grid, density=1.0, velocity=(0.0, -v0), fitted=fitted)
     floor = {
@@ -212,7 +212,6 @@ def ball(cells: int, wall: str, *, at=0.0, gap=0.6, nu=0.3, depth=0.05, fitted=T
         "SeparatingCollider": mpm.SeparatingCollider(mpm.HalfSpace((0.0, at * dx), (0.0, 1.0))),
         "ContactPlane": mpm.ContactPlane(1, at * dx),
     }[wall]
-    lasts = 2.943 * depth / v0
     dt = 0.3 * dx / np.sqrt((1 - nu) / (1 + nu) / (1 - 2 * nu))
     steps = int((gap * dx / v0 + 1.4 * lasts) / dt)
     run = mpm.simulate(
@@ -222,13 +221,36 @@ def ball(cells: int, wall: str, *, at=0.0, gap=0.6, nu=0.3, depth=0.05, fitted=T
         dt=dt,
         observe=lambda _, now: (now.mass * now.v[:, 1]).sum() / now.mass.sum(),
     )
-    # Hertz's motion, m ẍ = −K x^1.5, by small steps
-    fine, x, v = lasts / 20000, 0.0, [v0]
+    return _over_hertz(np.arange(steps + 1) * dt, -np.asarray(run.observed), nu, depth)
+
+
+def ball_of_elements(count: int, *, nu=0.3, depth=0.05) -> dict[str, float]:
+    """`ball` by finite elements, so many along a radius."""
+    mesh, (v0, lasts) = Mesh.half_disc(count), _hertz(nu, depth)
+    every, dt = 20, 0.03 / count
+    steps = int((0.02 / v0 + 1.4 * lasts) / dt / every) * every
+    fall = np.tile([0.0, -v0], (len(mesh.X), 1))
+    u = by_elements(mesh, 1.0, nu, 1.0, dt=dt, steps=steps, every=every, v=fall, floor=-1.02, revolved=True)
+    m = mesh.volumes(revolved=True)
+    sunk = np.append(0.0, -(u[..., 1] * m).sum(axis=1) / m.sum())
+    return _over_hertz((np.arange(steps // every) + 0.5) * every * dt, np.diff(sunk) / (every * dt), nu, depth)
+
+
+def _hertz(nu: float, depth: float) -> tuple[float, float]:
+    """The speed of a ball that is pressed in so deep, and how long it touches."""
+    v0 = float(np.sqrt(4 / 5 * 4 / 3 / (1 - nu**2) * depth**2.5 / (4 / 3 * np.pi)))
+    return v0, 2.943 * depth / v0
+
+
+def _over_hertz(t: np.ndarray, v: np.ndarray, nu: float, depth: float) -> dict[str, float]:
+    """Peak force and time of a velocity towards the plane over those of Hertz's motion, m ẍ = −K x^1.5."""
+    (v0, lasts), x = _hertz(nu, depth), 0.0
+    fine, exact = lasts / 20000, [v0]
     while x >= 0:
-        v.append(v[-1] - fine * stiffness * x**1.5 / mass)
-        x += fine * v[-1]
-    seen = _impact(np.arange(steps + 1) * dt, -np.asarray(run.observed), lasts / 8)
-    return dict(zip(("force", "time"), seen / _impact(np.arange(len(v)) * fine, np.array(v), lasts / 8), strict=True))
+        exact.append(exact[-1] - fine / (1 - nu**2) / np.pi * x**1.5)
+        x += fine * exact[-1]
+    ratios = _impact(t, v, lasts / 8) / _impact(np.arange(len(exact)) * fine, np.array(exact), lasts / 8)
+    return dict(zip(("force", "time"), ratios, strict=True))
 
 
 def _impact(t: np.ndarray, v: np.ndarray, width: float) -> np.ndarray:
@@ -251,6 +273,11 @@ def balls(quick: bool) -> None:
             ranges = (w([f[k] for f in found]) for k in ("force", "time") for w in (min, max))
             rows.append((f"{wall} {cells}", *ranges))
         _print(rows, (name, "force from", "to", "time from", "to"))
+    rows = [
+        (f"pressed in by {depth}", *ball_of_elements(8 if quick else 32, depth=depth).values())
+        for depth in (1 / 80, 1 / 40, 1 / 20, 1 / 10)
+    ]
+    _print(rows, ("finite elements", "force", "time"))
 
 
 TABLES = {"rest": rests, "bar": bars, "block": blocks, "ball": balls}

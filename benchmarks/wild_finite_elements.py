@@ -2,7 +2,8 @@
 
     python benchmarks/wild_finite_elements.py [--only plate,bar] [--draws 2]
 
-A cantilever that begins to sag, of one and of two layers; a plate with a hole that starts stretched and spinning; a
+A cantilever that begins to sag, of one and of two layers, and a short one that is thrown; a plate with a hole that
+starts stretched and spinning; a
 block that falls on a corner, and springs back from a smooth floor; in three dimensions a bar, held at its foot, that
 starts with a twist. Noise, starts and the lines are those of `wild_closed_forms.py`; Poisson's ratio is fitted too
 where it is named.
@@ -57,6 +58,19 @@ def cantilever(moduli: tuple[float, ...]) -> Case:
     return Case(scene, mpm.join(*layers) if n > 1 else layers[0], t1, 2e-4, sags, fitted)
 
 
+def thrown() -> Case:
+    """A short cantilever in nodes that are held, with a velocity at the start: it bends, shears and stretches."""
+    length, height, t1, modulus, nu = 0.4, 0.16, 0.3, 5e4, 0.3
+    mesh = Mesh.box((length, height), (80, 32))
+    speed = lambda x: jnp.stack([0.0 * x[..., 0], -6.0 * jnp.maximum(x[..., 0], 0.0) ** 2], axis=-1)  # noqa: E731
+    grid = mpm.Grid((30, 34), height / 4, origin=(-9, -9))
+    body = filled(mpm.Box((-3 * height / 4, 0.0), (length, height)), grid, speed)
+    scene = mpm.Scene(grid, mpm.NeoHookean(modulus, nu), boundary=mpm.StickyBox((0.0, -np.inf), (np.inf, np.inf)))
+    bends = moved(mesh, modulus, nu, t1, 5e-5, v=np.asarray(speed(mesh.X)), held=lambda X: X[:, 0] < 1e-9)
+    stays = lambda t, X: np.where(X[:, :1] > 0, bends(t, X), X)  # noqa: E731
+    return Case(scene, body, t1, 1e-3, stays, {"E": (E, modulus), "nu": (NU, nu)})
+
+
 def plate() -> Case:
     """With a hole, that starts stretched by its velocities and spinning."""
     side, radius, t1, modulus, nu = 0.4, 0.08, 0.3, 5e4, 0.35
@@ -107,6 +121,7 @@ def bar() -> Case:
 CASES: dict[str, Callable[[], Case]] = {
     "cantilever": lambda: cantilever((1e6,)),
     "two layers": lambda: cantilever((4e5, 2e6)),
+    "thrown": thrown,
     "plate": plate,
     "tilted": tilted,
     "bar": bar,

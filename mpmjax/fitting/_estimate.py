@@ -122,8 +122,11 @@ def shape_of(r: np.ndarray) -> tuple[float, str]:
 
 def strongest_mode(rows: np.ndarray) -> float:
     """The square of the largest singular value of residuals (f, c) in units of their noise, above the (√f + √c)² that
-    noise has (S. Geman, Ann. Probab. 8 (1980) 252, doi 10.1214/aop/1176994775)."""
-    return float(max(np.linalg.norm(rows, 2) ** 2 - np.sqrt(rows.shape).sum() ** 2, 0.0))
+    noise has (S. Geman, Ann. Probab. 8 (1980) 252, doi 10.1214/aop/1176994775); zero where chance may explain it
+    (I. M. Johnstone, Ann. Stat. 29 (2001) 295, doi 10.1214/aos/1009210544)."""
+    f, c = np.sqrt(rows.shape)
+    above = np.linalg.norm(rows, 2) ** 2 - (f + c) ** 2
+    return float(above) if above > _TRACY_WIDOM * (f + c) * (1 / f + 1 / c) ** (1 / 3) else 0.0
 
 
 def _correlation(rows: np.ndarray) -> tuple[float, float, float]:
@@ -157,6 +160,7 @@ def _correlation(rows: np.ndarray) -> tuple[float, float, float]:
 
 
 IMPROBABLE = 1e-3  # Probability, of noise alone, below which a misfit is beyond the noise, or residuals have a shape
+_TRACY_WIDOM = 3.27  # quantile of Tracy and Widom's distribution, of order one, that is as improbable
 _LEAST_ROWS = 8  # rows below which nothing is said of their order
 VALUE = f"{{:>12}} ± {'error':<9}"  # head of the first of `Estimate.cells`
 _FIRST_COLUMN = 24

@@ -313,15 +313,15 @@ def _judged(
     size, squares = float(np.sqrt((np.asarray(sigma) ** 2).mean())), (r[rows] ** 2).sum()
     misfit = float(np.sqrt(squares / max(count, 1)))
     ratio, left = noise(r, J, rows, count, *observation.trust)
-    missed = is_given and observation.trust == (1.0, None) and improbable(squares, left)
+    plain = is_given and observation.trust == (1.0, None)
+    missed = plain and improbable(squares, left)
     freedom, factor, kind, wider, strongest = np.inf if is_given else freedom, 1.0, "", 1.0, 0.0
     # What is left of exact data is the search's and rounding's.
     exact = max(_EXACT, _ROUNDINGS * float(jnp.finfo(problem.dtype).eps))
     if misfit * size > exact * observation.scale() and np.isfinite(ratio):
         order = np.argsort(observation.against[1])
         factor, kind = shape_of(r[rows].reshape(len(order), -1)[order])
-        # A misfit that noise or the spacing explains does not make a correlation larger.
-        if improbable((rest[rows] ** 2).sum(), left) if missed else kind and not is_given:
+        if plain or (kind and not is_given):
             strongest = weight * strongest_mode(rest[rows].reshape(len(order), -1) / np.sqrt(weight))
         wider = max(weight * factor * min(ratio, 1) ** 2, strongest, 1.0)  # noise alone has the variance `weight`
         factor, kind = (factor, kind) if wider > 1 else (1.0, "")
