@@ -3,6 +3,7 @@ how far XLA optimises what they compile."""
 
 import gc
 import os
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ def pytest_configure(config: Any) -> None:
         os.environ["XLA_FLAGS"] = " ".join((os.environ.get("XLA_FLAGS", ""), *QUICK_TO_COMPILE))
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
         return
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = KEPT.name
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_traceback_in_locations_limit", 0)  # no lines of Python in programs: a thirtieth of the time
@@ -35,6 +37,9 @@ def pytest_configure(config: Any) -> None:
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
 
+
+KEPT = tempfile.TemporaryDirectory()
+"""Where commands that tests start keep their programs, and not in the user's home."""
 
 QUICK_TO_COMPILE = [
     "--xla_backend_optimization_level=0",
