@@ -297,8 +297,9 @@ def main(quick: bool) -> None:
     for axes, (name, found) in zip(figure.subplots(1, 2), each.items(), strict=True):
         x, p = found["x"].reshape(3 * sizes[-1], -1, 2), found["p"].reshape(3 * sizes[-1], -1)
         shown = axes.pcolormesh(x[..., 0], x[..., 1], p, cmap="RdBu_r", vmin=-limit, vmax=limit)
-        axes.set(title=f"{name}: deflection {100 * (found['ratio'] - 1):+.1f} %", aspect="equal", xlabel="x [m]")
-    label = "pressure / (force / m²), to the 99th percentile averaged"
+        title = f"{name}: deflection {100 * (found['ratio'] - 1):+.1f} %"
+        axes.set(title=title, aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    label = "p / (force / m²), to the right's 99th percentile"
     figure.colorbar(shown, cax=axes.inset_axes((1.05, 0, 0.05, 1)), extend="both", label=label)
     figure.suptitle("Cook's membrane, ν = 0.4999, 32 cells", fontsize="medium")
     figure.savefig(Path(__file__).parents[1] / "docs" / "nearly_incompressible.png", dpi=110)
