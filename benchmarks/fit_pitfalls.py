@@ -60,12 +60,8 @@ def vibration(exact: VibratingBar, data: mpm.Tracks, cells: int = CELLS, start: 
     """The bar simulated, its stiffness first guessed as a multiple of the true one."""
     scene, particles = discretise(exact, cells)
     _, coarse = discretise(exact, CELLS)
-    tracks = mpm.Tracks(
-        data.times,
-        data.data,
-        which=mpm.fitting.Markers.at(particles, np.asarray(data.of(scene, coarse))) if cells != CELLS else data.of,
-        sigma=data.sigma,
-    )
+    fine = mpm.fitting.Markers.at(particles, np.asarray(data.which(scene, coarse)))
+    tracks = mpm.Tracks(data.times, data.data, which=data.which if cells == CELLS else fine, sigma=data.sigma)
     scene = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, jnp.asarray(start * E))
     steps = int(np.ceil(data.times[-1] / exact.duration * STEPS * cells / CELLS))
     dt = float(data.times[-1]) / steps
@@ -240,13 +236,13 @@ def discretisation(quick: bool) -> plt.Figure:
         found = [mpm.fit(vibration(exact, data, n), {"E": STIFFNESS}, starts=1)["E"] for n in cells]
         refined = mpm.fitting.fit_refined(lambda n: vibration(exact, data, 5 * n), {"E": STIFFNESS}, refinements=coarse)
     for n, e in zip(cells, found, strict=True):
-        print(f"{n} cells: E = {e.value / E:.5f} ± {e.error / E:.5f} of the true one")
+        print(f"{n} cells: E = {e.value / E:.5f} ± {e.noise_error / E:.5f} by noise of the true one")
     print(refined)
     figure, axis = plt.subplots(figsize=(5.6, 3.6), layout="constrained")
     axis.errorbar(
         [1 / n for n in cells],
         [e.value / E for e in found],
-        [2 * e.error / E for e in found],
+        [2 * e.noise_error / E for e in found],
         fmt="o-",
         markersize=3,
         capsize=2,

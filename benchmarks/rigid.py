@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import ListedColormap
 
 import mpmjax as mpm
 from mpmjax.geometry import RigidBody, rigid_body, spinning
@@ -51,14 +53,18 @@ def drop(quick: bool) -> None:
 
 def draw(run: mpm.Run, first: int) -> None:
     """The block and the disk at four times, the half of the disk that was above in another colour."""
-    frames = np.asarray(run.frames.x)
-    above = frames[0, first:, 1] > frames[0, first:, 1].mean()
-    figure, axes = plt.subplots(1, len(frames), figsize=(9, 2.3), layout="constrained", sharey=True)
-    for axis, x, t in zip(axes, frames, np.asarray(run.times), strict=True):
-        axis.plot(*x[:first].T, ".", color="0.7", markersize=2)
-        for half, colour in ((above, "C0"), (~above, "C1")):
-            axis.plot(*x[first:][half].T, ".", color=colour, markersize=3)
-        axis.set(aspect="equal", title=f"{t:.1f} s", xlim=(-0.1, 2.1), ylim=(-0.05, 1.3))
+    frames, F = np.asarray(run.frames.x), np.concatenate([np.asarray(a) for a in run.frames.deformations], axis=1)
+    side = np.sqrt(np.asarray(run.final.volume))[:, None, None] / 2 * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+    squares = frames[:, :, None] + np.einsum("tpij,pkj->tpki", F, side)
+    kind = np.where(frames[0, :, 1] > frames[0, first:, 1].mean(), 1.0, 2.0)
+    kind[:first] = 0
+    look = {"cmap": ListedColormap(["silver", "C0", "C1"]), "clim": (0, 2)}
+    figure, axes = plt.subplots(1, len(frames), figsize=(9, 1.9), layout="constrained", sharey=True)
+    for axis, x, square, t in zip(axes, frames, squares, np.asarray(run.times), strict=True):
+        axis.add_collection(PolyCollection(square, array=kind, antialiaseds=False, **look))
+        axis.tripcolor(*x[first:].T, kind[first:], **look)  # between the squares of the disk's rings
+        axis.set(aspect="equal", title=f"t = {t:.1f} s", xlim=(-0.1, 2.1), ylim=(0, 1.3), xlabel="x [m]")
+    axes[0].set_ylabel("y [m]")
     figure.savefig(DOCS / "rigid.png", dpi=130)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import optax
+from matplotlib.collections import PolyCollection
 
 import mpmjax as mpm
 
@@ -80,12 +81,14 @@ for _ in range(ITERATIONS):
 
 # %%
 figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+corners = np.sqrt(np.asarray(ball.volume))[:, None, None] / 2 * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
 for number, target in enumerate([*targets, unseen]):
     run = throw(network, target, save_every=STEPS // 7)
     colour, x = f"C{number}", np.asarray(run.frames.x)
-    axes.scatter(*x.reshape(-1, 2).T, s=3, color=colour, linewidths=0)
+    squares = x[:, :, None] + np.einsum("tpij,pkj->tpki", run.frames.F, corners)  # which deform with their particles
+    axes.add_collection(PolyCollection(squares.reshape(-1, 4, 2), facecolors=colour, antialiaseds=False, alpha=0.4))
     axes.plot(*x.mean(axis=1).T, color=colour, lw=1)
-    axes.plot(*target, marker="x" if number < 3 else "+", ms=12, mew=2, color=colour)
+    axes.plot(*target, marker="x" if number < 3 else "+", ms=12, mew=2, color="k", zorder=3)
     print(f"{'trained' if number < 3 else 'unseen'} target {target} m: {100 * float(miss(network, target)):.1f} cm off")
 axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="x: trained at, +: never seen")
 figure.savefig("throw.png", dpi=110)

@@ -15,6 +15,7 @@ from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene, history_arrays
 from mpmjax.viz._film import film_pictures, write_film
+from mpmjax.viz._surface import gaps, outward, skin
 
 COLOURS: dict[str, tuple[str, Callable[[Scene, Particles], Any]]] = {
     **{name: field for name, field in FIELDS.items() if name != "stress"},
@@ -25,7 +26,6 @@ _SMOOTHED = ("pressure", "von_mises")  # they oscillate from particle to particl
 
 SNOW, OCHRE, STEEL, MOSS = (0.91, 0.93, 0.96), (0.82, 0.55, 0.33), (0.36, 0.5, 0.66), (0.45, 0.62, 0.42)
 STONE = (0.55, 0.54, 0.52)  # the colour of walls and colliders
-_MOST_CELLS = 90  # cells in a direction of the lattice by which particles are shaded
 
 Draw = Callable[[Particles, np.ndarray, float], list[Any]]
 """Draws particles, with their values, at a time [s], and returns all that differs from frame to frame."""
@@ -45,10 +45,10 @@ def render(
     """Draw a run: one frame as a still (.png, .pdf, .svg) or all of them as a film (.gif, or .mp4 where ffmpeg is).
 
     In two dimensions particles are squares of their undeformed volume that deform with them and so fill the body; where
-    a law yields or flows, F has lost the shape, and they are twice as wide. Walls are lines. In three they are balls
-    sorted by depth, half as large again, so that they close into a body, and shaded by its surface in a light from the
-    upper left; up is against gravity's largest component (the last axis without gravity), and the ground is the highest
-    wall or plane that bears, else a little below the particles. All frames of a run have the same view and scale.
+    a law yields or flows, F has lost the shape, and gaps of less than four widths are filled. Walls are lines. In three
+    they are balls sorted by depth, half as large again, so that they close into a body, and shaded by its surface in a
+    light from the upper left; up is against gravity's largest component (the last axis without gravity), and the ground
+    is the highest wall or plane that bears, else a little below the particles. All frames have the same view and scale.
     Colours go from the 1st to the 99th percentile of all values shown, as the bar's label says where some lie beyond.
 
     Args:
@@ -185,20 +185,6 @@ def _obstacles(scene: Scene, t: float) -> Iterator[Callable[[np.ndarray], np.nda
             yield lambda x, body=boundary: np.asarray(body.distance(jnp.asarray(x, dtype), t))
 
 
-def skin(
-    distance: Callable[[np.ndarray], np.ndarray], lower: np.ndarray, upper: np.ndarray, spacing: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points on a shape's surface and its outward normals there, each (n, d), about a `spacing` apart [m], between
-    two corners [m], (d,), from the signed distance to the shape [m] of points (m, d), negative inside."""
-    axes = [np.arange(a, b + spacing, spacing) for a, b in zip(lower, upper, strict=True)]
-    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-    x = x[np.abs(distance(x)) < 0.5 * len(axes) ** 0.5 * spacing]
-    steps = 1e-2 * spacing * np.eye(len(axes))
-    normal = np.stack([distance(x + e) - distance(x - e) for e in steps], axis=1)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(np.finfo(float).tiny)
-    return x - distance(x)[:, None] * normal, normal
-
-
 def _upright(scene: Scene) -> np.ndarray:
     """To the right, away and up, one a row, (3, 3): up is against gravity's largest component."""
     gravity = np.asarray(scene.gravity, float)
@@ -268,10 +254,10 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
     def draw(particles: Particles, values: np.ndarray, t: float) -> list[Any]:
         x, (rock, normal) = np.asarray(particles.x, float) @ turn.T, stones(t)
         there = np.asarray(particles.mass) > 0
-        outward = np.zeros_like(x)
+        normals = np.zeros_like(x)
         if there.any():
-            outward[there] = _outward(x[there], volume[there])
-        normals = np.concatenate([outward, normal])
+            normals[there] = outward(x[there], volume[there])
+        normals = np.concatenate([normals, normal])
         facing = (normals @ light)[:, None]
         colour = np.concatenate([_tinted(particles, bar, values), np.tile(STONE, (len(rock), 1))])
         colour = np.clip(colour * np.where(facing > 0, 0.75 + 0.3 * facing, 0.75 + 0.4 * facing), 0, 1)
@@ -316,24 +302,6 @@ def _solid_axes(figure: Any, lower: np.ndarray, upper: np.ndarray, turn: np.ndar
         tick.label1.set_visible(not any(box.overlaps(other) for other in taken))
         taken += [box] * tick.label1.get_visible()
     return axes
-
-
-def _outward(x: np.ndarray, volume: np.ndarray) -> np.ndarray:
-    """The outward normals of a body at its particles [-], (p, 3), at x [m]: about 1 long at its surface, 0 in its
-    inside. They are the slope of how full the space is, on a lattice of cells as large as the particles."""
-    from scipy import ndimage  # here, since it takes long to import
-
-    lower, upper = x.min(axis=0), x.max(axis=0)
-    cell = max(float(volume.mean()) ** (1 / 3), float((upper - lower).max()) / _MOST_CELLS)
-    place = (x - lower) / cell + 3.5
-    shape = tuple(((upper - lower) / cell).astype(int) + 8)
-    index = np.ravel_multi_index(tuple(place.astype(int).T), shape)
-    full = np.bincount(index, volume / cell**3, minlength=int(np.prod(shape))).reshape(shape)
-    full = ndimage.gaussian_filter(full, 1.5)
-    at = partial(ndimage.map_coordinates, coordinates=place.T - 0.5, order=1, mode="nearest")
-    slope = np.stack([at(a) for a in np.gradient(full)], axis=1)
-    normal = -1.5 * slope / np.maximum(at(full), 0.2)[:, None]
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1)
 
 
 def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
@@ -394,14 +362,19 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
     def draw(particles: Particles, values: np.ndarray, t: float) -> list[Any]:
         place, F = np.zeros((particles.count, 2)), np.tile(np.eye(2), (particles.count, 1, 1))
         place[:, :d] = particles.x
+        present, flows = np.asarray(particles.mass) > 0, np.zeros(particles.count, bool)
         for (rows, stored, _), law in zip(particles.groups, run.scene.laws, strict=True):
             a = np.asarray(stored)
             F[rows, :d, :d] = a[:, :d, :d] if a.ndim == 3 else a[:, None, None] ** (1 / d) * np.eye(d)
-            F[rows] *= 2.0 if a.ndim == 1 or law.relaxes_stress else 1.0  # F does not say how they are stretched
-        F *= (np.asarray(particles.mass) > 0)[:, None, None]  # others are not there
-        square, colours = place[:, None] + np.einsum("pij,pkj->pki", F, corners), _tinted(particles, bar, values)
-        squares.set_verts(whole(square))
-        squares.set_facecolor(np.concatenate([colours, colours]) if grid.axisymmetric else colours)
+            if a.ndim == 1 or law.relaxes_stress:  # F does not say how they are stretched
+                flows[rows] = present[rows]
+                F[rows] *= 3 - d  # in one dimension they overlap
+        F *= present[:, None, None]  # others are not there
+        colours = np.tile(_tinted(particles, bar, values), (2 if grid.axisymmetric else 1, 1))
+        square = whole(place[:, None] + np.einsum("pij,pkj->pki", F, corners))
+        gap = gaps(whole(place), np.tile(flows, len(square) // len(flows)), 4 * margin)
+        squares.set_verts(np.concatenate([whole(place)[gap], square]))
+        squares.set_facecolor(np.concatenate([colours[gap].mean(axis=1), colours]))
         while stones:
             stones.pop().remove()
         for distance in _obstacles(run.scene, t) if d == 2 else ():
