@@ -70,6 +70,11 @@ class AbstractContact(eqx.Module):
         Default: it may not be."""
         return False
 
+    def earlier(self, time: Scalar) -> "AbstractContact":
+        """The contact with its surface where it is at a time before the end of the step [s], to first order. Default:
+        the same, of what is at rest or has no springs."""
+        return self
+
     def images(self, active: Array) -> tuple[Any, ...]:
         """The mirrors that stand in the places held. Default: none."""
         return ()
@@ -213,6 +218,11 @@ class ConstrainedNodes(eqx.Module):
     def moved(self) -> Displacement:
         """`displacement`, of all nodes."""
         return self.unconstrained.potential.displaced(self.displacement)
+
+    def earlier(self, time: Scalar) -> "ConstrainedNodes":
+        """The same with surfaces where they are at a time before the end of the step [s]."""
+        contacts = tuple(contact.earlier(time) for contact in self.unconstrained.contacts)
+        return replace(self, unconstrained=replace(self.unconstrained, contacts=contacts))
 
     def beyond_boundaries(self) -> tuple[Mask, tuple[NodeVector, ...]]:
         """The components of velocity that no boundary holds, shape (n, d), and the normals that colliders hold."""

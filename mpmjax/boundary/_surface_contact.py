@@ -10,6 +10,7 @@ is linear in the displacement of the nodes about the start of the step. The forc
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -176,6 +177,7 @@ class SurfaceContact(AbstractSpringContact):
     coefficient: Scalar  # Coulomb coefficient [-]
     axis: int | None = eqx.field(static=True)  # the axis of its normal; None if that is along no axis
     beside: Bool[Array, "s p"] | None = None  # the particles that it may push, shape (s, p); None for all
+    before: Scalar | None = None  # how long before `Faces.push_time` the surface is taken [s]; None for not at all
 
     @property
     def near(self) -> Bool[Array, "s p"]:
@@ -184,7 +186,13 @@ class SurfaceContact(AbstractSpringContact):
         near = jnp.abs(self.gap) < self.faces.spacing
         return near if self.beside is None else near & self.beside
 
+    def earlier(self, time: Scalar) -> "SurfaceContact":
+        return self if self.velocity is None else replace(self, before=time)
+
     def spread(self, stretch: Array, stiffness: Array) -> Springs:
+        if self.before is not None and self.velocity is not None:
+            way = self.share * self.before * (self.normal * self.velocity).sum(axis=0)
+            stretch = stretch + jnp.stack([sign * way for sign in SIGNS[: len(stretch)]])
         return Springs(stretch, stiffness, self.normal, self.arm)
 
     @staticmethod
