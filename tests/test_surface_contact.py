@@ -505,6 +505,22 @@ def test_a_fluid_thrown_faster_than_its_sound_does_not_pass_the_floor(law, d, ma
     assert float(final.x[:, -1].min()) > -0.05
 
 
+@pytest.mark.parametrize("friction", [0.0, *thorough(0.3)])
+def test_what_a_plate_presses_follows_it_within_a_step(friction):
+    """At a constant speed: the force of TR-BDF2 is that of steps a quarter as long, and of a method of one stage."""
+    grid, body = block(cells=2)
+    way = mpm.Motion((0.0, 10.0), ((0.0, 0.0), (0.0, -0.02)))
+    plate = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.2), (0.0, -1.0)), way, friction)
+    scene = mpm.Scene(grid, LAW, boundary=(mpm.SymmetryPlane(1, 0.0), plate))
+
+    def force(method, dt):
+        times, of_plate, _ = mpm.simulate(scene, body, t1=8.0, dt=dt, method=METHODS[method], save_every=1).forces()
+        return np.interp(5.0, times, of_plate[:, 0, 1])
+    for m in METHODS:
+        if m!='explicit': print(m, force(m, 1.0), force(m,.25))
+    assert_close(force("trbdf2", 1.0), [force("trbdf2", 0.25), force("semi_implicit", 1.0)], 0.01)
+
+
 @pytest.mark.thorough
 def test_a_particle_behind_the_surface_by_a_spacing_is_left_alone():
     _, body = block(1)

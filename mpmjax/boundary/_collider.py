@@ -280,8 +280,8 @@ class SeparatingCollider(AbstractCollider):
         held = [plane_contact((wall,), (plane[2],), self.friction, around[:, k, None]) for k, (wall, plane) in each]
         # an explicit step's springs push no face before the surface; of what is held only what went through a map
         pushed = ~flowing if faces.explicit else ~shut
-        beside = pushed | (~along.any() & (now.distance < -_FAR * faces.spacing))
-        return replace(springs, beside=beside[None]), flow, *held
+        pushed = pushed | (~along.any() & (now.distance < -_FAR * faces.spacing))
+        return replace(springs, near=springs.near & pushed), flow, *held
 
     def check(self, grid: Grid, *, total: bool) -> None:
         del grid

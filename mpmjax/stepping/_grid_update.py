@@ -48,20 +48,15 @@ class StageContact(eqx.Module):
 
     held: ConstrainedNodes  # the nodes with the active set held
 
-    def earlier(self, share: Scalar) -> ConstrainedNodes:
-        """The nodes with surfaces where they are at the end of the stage, at the share γ of the step."""
-        return self.held.earlier((1 - share) * self.held.nodes.dt)
-
-    def change(self, share: Scalar) -> NodeVector:
-        """The force that surfaces so placed add to that of the nodes [N], shape (n, d)."""
+    def change(self, share: Scalar) -> NodeVector | None:
+        """The force that surfaces so placed add to that of the nodes [N], shape (n, d), with γ; None if all rest."""
         potential, contacts = self.held.nodes.potential, self.held.unconstrained.contacts
-        each, rest = zip(contacts, self.earlier(share).unconstrained.contacts, self.held.active, strict=True), potential.displaced(None)
-        forces = [
-            jax.tree.map(jnp.subtract, *(c.springs(active).force(rest) for c in (early, late)))
-            for late, early, active in each
-            if early is not late
-        ]
-        return potential.on_nodes(forces) if forces else jnp.zeros_like(self.held.nodes.v)
+        rest, forces = potential.displaced(None), []
+        for late, active in zip(contacts, self.held.active, strict=True):
+            if (early := late.at(share)) is not late:
+                each = (contact.springs(active).force(rest) for contact in (early, late))
+                forces.append(jax.tree.map(jnp.subtract, *each))
+        return potential.on_nodes(forces) if forces else None
 
     def friction(self, method: AbstractImplicitIntegrator, v: NodeVector, u: NodeVector, share: Scalar) -> NodeVector:
         """The change of velocity by friction at the end of the stage [m/s], shape (n, d).
@@ -82,7 +77,7 @@ class StageContact(eqx.Module):
         missing = reaction(nodes, motion, method.elastic_impulse(nodes, motion, ((0.5, None), (0.5, u))))
         # the share γ of an impulse on a mass is that impulse on 1/γ of the mass
         rubbed, loose = (each and replace(each, mass=each.mass / share) for each in (rubbed, rubbed.loose))
-        held = replace(self.earlier(share), displacement=u / 2, nodes=replace(rubbed, loose=loose))
+        held = replace(self.held.at(share), displacement=u / 2, nodes=replace(rubbed, loose=loose))
         change = held.friction(v, held.without_spring_impulses(missing))[0] - v
         return jnp.where(rubbed.occupied, held.images.unscaled(change), 0)
 

@@ -315,8 +315,8 @@ class TRBDF2(AbstractImplicitIntegrator):
         # G_0 is that of the start: no force is evaluated for it
         pull = nodes.per_mass(nodes.force - nodes.potential.viscous_resistance(v0) if viscous else nodes.force)
         inertial = v0 + length * (pull + 2 * g)
-        if nodes.inner is not None:
-            inertial = inertial + 2 * length * nodes.per_mass(nodes.inner.change(gamma))
+        if nodes.inner is not None and (change := nodes.inner.change(gamma)) is not None:
+            inertial = inertial + 2 * length * nodes.per_mass(change)
         middle, first = self.solve_stage(nodes, guess, inertial, length, length * v0)
         inner, solved, friction = q2 * (v0 + middle), middle, None
         if nodes.inner is not None:
