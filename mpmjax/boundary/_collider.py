@@ -252,8 +252,8 @@ class SeparatingCollider(AbstractCollider):
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         motion = self.moved_by(x.dtype)
         distance, normal = self.sloped(motion.origin(x, push_time), push_time)
-        velocity = motion.velocity_of(motion.origin(x, t), t, dt)
-        return (Surface(distance, normal.T, self.friction, velocity.T),)
+        velocity = self.wall_velocity(x, t, dt)
+        return (Surface(distance, normal.T, self.friction, None if velocity is None else velocity.T),)
 
     def contacts(
         self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
