@@ -320,7 +320,7 @@ class TRBDF2(AbstractImplicitIntegrator):
         middle, first = self.solve_stage(nodes, guess, inertial, length, length * v0)
         inner, solved, friction = q2 * (v0 + middle), middle, None
         if nodes.inner is not None:
-            change = nodes.inner.friction(self, middle, dt * inner, gamma)
+            change = nodes.inner.friction(self, middle, dt * inner, 2 * q2)
             middle, friction = middle + change, q1 / q2 * change
         later_pull = (middle - inertial) / length  # f_γ/m, with viscosity and friction, by the stage's own equation
         inertial = v0 + dt * (q0 * pull + q1 * later_pull + g)
