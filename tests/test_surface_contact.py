@@ -505,6 +505,25 @@ def test_a_fluid_thrown_faster_than_its_sound_does_not_pass_the_floor(law, d, ma
     assert float(final.x[:, -1].min()) > -0.05
 
 
+@pytest.mark.parametrize(
+    ("method", "dt"), [("trbdf2", 1.0), *thorough(("trbdf2", 0.25), ("semi_implicit", 1.0), ("implicit_midpoint", 1.0))]
+)
+def test_what_a_plate_presses_follows_it_within_a_step(method, dt):
+    """At a constant speed between walls: the force is that of the column and the springs, one behind the other."""
+    speed, height = 0.002, 0.2
+    grid, body = block(cells=2)
+    way = mpm.Motion((0.0, 10.0), ((0.0, 0.0), (0.0, -10 * speed)))
+    plate = mpm.SeparatingCollider(mpm.HalfSpace((0.0, height), (0.0, -1.0)), way, 0.3)
+    sides = mpm.SymmetryPlane(0, 0.0), mpm.SymmetryPlane(0, 0.2, keep="below")
+    scene = mpm.Scene(grid, LAW, boundary=(mpm.SymmetryPlane(1, 0.0), *sides, plate))
+    run = mpm.simulate(scene, body, t1=6.0, dt=dt, method=METHODS[method], save_every=1)
+    times, force, _ = run.forces()
+    softer = 1 + grid.spacing / (20 * height)
+    stretch = 1 - 5 * speed / (softer * height)
+    stress = -float(LAW.stress(jnp.diag(jnp.array([1.0, stretch]))[..., None])[1, 1, 0])
+    assert_close(np.interp(5.0, times, force[:, 0, 1]), 0.2 * stress, 0.01)
+
+
 @pytest.mark.thorough
 def test_a_particle_behind_the_surface_by_a_spacing_is_left_alone():
     _, body = block(1)

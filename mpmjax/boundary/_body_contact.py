@@ -168,6 +168,7 @@ class BodyContact(AbstractSpringContact):
     """
 
     gap: Float[Array, "m"]  # g_i at the start of the step [m], shape (m,); infinite where a body is not felt
+    near: Bool[Array, "m"]  # the nodes at which both bodies are felt, shape (m,)
     normal: Float[Array, "m d"]  # n_i [-], from the second body to the first, shape (m, d)
     stiffness: Float[Array, "m"]
     grip: Float[Array, "m"]  # f [-], shape (m,)
@@ -176,11 +177,6 @@ class BodyContact(AbstractSpringContact):
     share: Scalar
     patch: Patch  # the nodes around each, by c_a c_b/(c_a + c_b) of the two bodies
     pair: tuple[int, int] = eqx.field(static=True)  # the numbers of the bodies
-
-    @property
-    def near(self) -> Bool[Array, "m"]:
-        """The nodes at which both bodies are felt, shape (m,)."""
-        return jnp.isfinite(self.gap)
 
     def spread(self, stretch: Array, stiffness: Array) -> Coupling:
         across = jnp.zeros_like(self.normal.T)
@@ -265,6 +261,7 @@ def body_contact(
     slides = felt & (slip > holds)
     return BodyContact(
         gap=jnp.where(felt, gap, jnp.inf),
+        near=felt,
         normal=normal.T,
         stiffness=jnp.where(felt, STIFFNESS * modulus / spacing * area, 0),
         grip=jnp.where(friction > 0, jnp.where(slides, holds / jnp.where(slides, slip, 1), 1) ** 2, 0),

@@ -252,8 +252,8 @@ class SeparatingCollider(AbstractCollider):
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         motion = self.moved_by(x.dtype)
         distance, normal = self.sloped(motion.origin(x, push_time), push_time)
-        velocity = motion.velocity_of(motion.origin(x, t), t, dt)
-        return (Surface(distance, normal.T, self.friction, velocity.T),)
+        velocity = self.wall_velocity(x, t, dt)
+        return (Surface(distance, normal.T, self.friction, None if velocity is None else velocity.T),)
 
     def contacts(
         self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
@@ -280,8 +280,8 @@ class SeparatingCollider(AbstractCollider):
         held = [plane_contact((wall,), (plane[2],), self.friction, around[:, k, None]) for k, (wall, plane) in each]
         # an explicit step's springs push no face before the surface; of what is held only what went through a map
         pushed = ~flowing if faces.explicit else ~shut
-        beside = pushed | (~along.any() & (now.distance < -_FAR * faces.spacing))
-        return replace(springs, beside=beside[None]), flow, *held
+        pushed = pushed | (~along.any() & (now.distance < -_FAR * faces.spacing))
+        return replace(springs, near=springs.near & pushed), flow, *held
 
     def check(self, grid: Grid, *, total: bool) -> None:
         del grid

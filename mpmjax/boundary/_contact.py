@@ -70,6 +70,10 @@ class AbstractContact(eqx.Module):
         Default: it may not be."""
         return False
 
+    def at(self, share: Scalar) -> "AbstractContact":
+        """The contact with its surface where it is after a share of the step. Default: itself, as at rest."""
+        return self
+
     def images(self, active: Array) -> tuple[Any, ...]:
         """The mirrors that stand in the places held. Default: none."""
         return ()
@@ -151,14 +155,10 @@ class AbstractSpringContact(AbstractContact):
     stiffness: eqx.AbstractVar[Array]  # k [N/m], in the same shape
     dt: eqx.AbstractVar[Scalar]  # Δt [s]
     share: eqx.AbstractVar[Scalar]  # θ; 1 where forces are those at the start of the step
+    near: eqx.AbstractVar[Array]  # whether a place may touch in this step, in the same shape
 
     def known_at_start(self, nodes: Any, explicit: bool) -> bool:
         return explicit
-
-    @property
-    @abc.abstractmethod
-    def near(self) -> Bool[Array, "..."]:
-        """The places that may touch in this step, in the shape of the gaps."""
 
     @abc.abstractmethod
     def spread(self, stretch: Array, stiffness: Array) -> AbstractSpring:
@@ -213,6 +213,11 @@ class ConstrainedNodes(eqx.Module):
     def moved(self) -> Displacement:
         """`displacement`, of all nodes."""
         return self.unconstrained.potential.displaced(self.displacement)
+
+    def at(self, share: Scalar) -> "ConstrainedNodes":
+        """The same with surfaces where they are after a share of the step."""
+        contacts = tuple(contact.at(share) for contact in self.unconstrained.contacts)
+        return replace(self, unconstrained=replace(self.unconstrained, contacts=contacts))
 
     def beyond_boundaries(self) -> tuple[Mask, tuple[NodeVector, ...]]:
         """The components of velocity that no boundary holds, shape (n, d), and the normals that colliders hold."""

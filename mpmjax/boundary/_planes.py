@@ -264,4 +264,4 @@ class ContactPlane(AbstractPlane):
         order, position = len(faces.stencil.basis.knots) - 1, jax.lax.stop_gradient(self.position)  # the lattice goes
         wall = wall_image(self.axis, position, self.inward, grid, window, order)
         plane = plane_contact((wall,), (self.inward,), self.friction, around)
-        return (plane,) if faces.explicit else (replace(landing, beside=~shut), plane)
+        return (plane,) if faces.explicit else (replace(landing, near=landing.near & ~shut), plane)

@@ -10,6 +10,7 @@ is linear in the displacement of the nodes about the start of the step. The forc
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -166,6 +167,9 @@ class SurfaceContact(AbstractSpringContact):
     """
 
     gap: Float[Array, "s p"]
+    near: Bool[Array, "s p"]
+    """The particles that it may push, whose face is less than a spacing before or behind the surface: one that is
+    further does not come to it in a step, or has passed it."""
     normal: Float[Array, "d p"]  # n_p of the first surface [-], shape (d, p)
     arm: Float[Array, "d p"]  # b_p at the first surface [m], shape (d, p) (see `Springs`)
     stiffness: Float[Array, "s p"]
@@ -175,14 +179,12 @@ class SurfaceContact(AbstractSpringContact):
     share: Scalar
     coefficient: Scalar  # Coulomb coefficient [-]
     axis: int | None = eqx.field(static=True)  # the axis of its normal; None if that is along no axis
-    beside: Bool[Array, "s p"] | None = None  # the particles that it may push, shape (s, p); None for all
 
-    @property
-    def near(self) -> Bool[Array, "s p"]:
-        """The particles whose face is less than a spacing before or behind the surface: one that is further does not
-        come to it in a step, or has passed it."""
-        near = jnp.abs(self.gap) < self.faces.spacing
-        return near if self.beside is None else near & self.beside
+    def at(self, share: Scalar) -> "SurfaceContact":
+        if self.velocity is None:
+            return self
+        way = (1 - share) * self.dt * (self.normal * self.velocity).sum(axis=0)
+        return replace(self, gap=self.gap + jnp.stack([sign * way for sign in SIGNS[: len(self.gap)]]))
 
     def spread(self, stretch: Array, stiffness: Array) -> Springs:
         return Springs(stretch, stiffness, self.normal, self.arm)
@@ -225,8 +227,10 @@ def surface_contact(surface: Surface, faces: Faces) -> SurfaceContact:
     relative = faces.v.T if surface.velocity is None else faces.v.T - surface.velocity
     leaving = (surface.normal * relative).sum(axis=0)
     distances = (surface.distance,) if surface.opposite is None else (surface.distance, surface.opposite)
+    gap = jnp.stack(distances) - width
     return SurfaceContact(
-        gap=jnp.stack(distances) - width,
+        gap=gap,
+        near=jnp.abs(gap) < faces.spacing,
         normal=surface.normal,
         arm=arm,
         stiffness=jnp.stack([faces.stiffness_at(-sign * leaving) for sign in SIGNS[: len(distances)]]),

@@ -214,7 +214,7 @@ class SeparatingBox(AbstractBox):
         contacts: list[AbstractContact] = []
         for axis, surface in enumerate(surfaces):
             if not (faces.explicit and flowing.all()):
-                contacts.append(replace(surface, beside=~shut[axis]))
+                contacts.append(replace(surface, near=surface.near & ~shut[axis]))
             walls = wall_images(self.across(axis), faces, grid, window)
             contacts.append(plane_contact(walls, SIGNS, self.friction, around[:, 2 * axis : 2 * axis + 2]))
         return tuple(contacts)

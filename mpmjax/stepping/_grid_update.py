@@ -42,13 +42,24 @@ class GridUpdate(eqx.Module):
         return self.constrained.images.unfold(self.constrained.nodes.admitted_velocity())
 
 
-class StageFriction(eqx.Module):
-    """Friction at the end of a trapezoidal stage, so that the next stage begins from what sticks."""
+class StageContact(eqx.Module):
+    """Contact in a trapezoidal stage of the length γΔt, with surfaces where they are at its end, and with friction
+    there, so that the next stage begins from what sticks."""
 
     held: ConstrainedNodes  # the nodes with the active set held
 
-    def __call__(self, method: AbstractImplicitIntegrator, v: NodeVector, u: NodeVector, share: Scalar) -> NodeVector:
-        """The change of velocity [m/s], shape (n, d), in a stage of the length γΔt.
+    def change(self, share: Scalar) -> NodeVector | None:
+        """The force that surfaces so placed add to that of the nodes [N], shape (n, d), with γ; None if all rest."""
+        potential, contacts = self.held.nodes.potential, self.held.unconstrained.contacts
+        rest, forces = potential.displaced(None), []
+        for late, active in zip(contacts, self.held.active, strict=True):
+            if (early := late.at(share)) is not late:
+                each = (contact.springs(active).force(rest) for contact in (early, late))
+                forces.append(jax.tree.map(jnp.subtract, *each))
+        return potential.on_nodes(forces) if forces else None
+
+    def friction(self, method: AbstractImplicitIntegrator, v: NodeVector, u: NodeVector, share: Scalar) -> NodeVector:
+        """The change of velocity by friction at the end of the stage [m/s], shape (n, d).
 
         Args:
             method: the integrator.
@@ -66,7 +77,7 @@ class StageFriction(eqx.Module):
         missing = reaction(nodes, motion, method.elastic_impulse(nodes, motion, ((0.5, None), (0.5, u))))
         # the share γ of an impulse on a mass is that impulse on 1/γ of the mass
         rubbed, loose = (each and replace(each, mass=each.mass / share) for each in (rubbed, rubbed.loose))
-        held = replace(self.held, displacement=u / 2, nodes=replace(rubbed, loose=loose))
+        held = replace(self.held.at(share), displacement=u / 2, nodes=replace(rubbed, loose=loose))
         change = held.friction(v, held.without_spring_impulses(missing))[0] - v
         return jnp.where(rubbed.occupied, held.images.unscaled(change), 0)
 
@@ -118,7 +129,7 @@ def _solve_held(
     """The nodes with their displacement, their update before friction at the end, and the impulse that holds components
     of velocity [kg m/s], shape (n, d)."""
     nodes = held.unconstrained
-    motion, info = method.advance(replace(held.nodes, friction=StageFriction(held)), guess)
+    motion, info = method.advance(replace(held.nodes, inner=StageContact(held)), guess)
     motion = solved = jax.tree.map(held.images.unfold, motion)
     if motion.friction is not None:
         # the equations of the nodes, which say what walls hold, know nothing of an inner stage's friction

@@ -289,7 +289,6 @@ class TRBDF2(AbstractImplicitIntegrator):
     from what sticks and a body at rest stays there. Over the step it takes at most μ times the push of the step.
 
     *When it breaks*: as `ImplicitMidpoint`. Near ρ∞ = 1 what a wall's friction can hold oscillates as its push does.
-    What a moving `SeparatingCollider` pushes stays behind it by its way in a step: that force is half a step late.
 
     Args:
         rho: ρ∞, from 0 to 1.
@@ -309,17 +308,19 @@ class TRBDF2(AbstractImplicitIntegrator):
         return gamma, 1 - q1 - gamma / 2, q1, gamma / 2
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
-        _, q0, q1, q2 = self.weights()
+        gamma, q0, q1, q2 = self.weights()
         dt, g, v0 = nodes.dt, nodes.acceleration, nodes.admitted_velocity()
         length = q2 * dt  # Δt_s = ½γΔt
         viscous = nodes.potential.viscous
         # G_0 is that of the start: no force is evaluated for it
         pull = nodes.per_mass(nodes.force - nodes.potential.viscous_resistance(v0) if viscous else nodes.force)
         inertial = v0 + length * (pull + 2 * g)
+        if nodes.inner is not None and (change := nodes.inner.change(gamma)) is not None:
+            inertial = inertial + 2 * length * nodes.per_mass(change)
         middle, first = self.solve_stage(nodes, guess, inertial, length, length * v0)
         inner, solved, friction = q2 * (v0 + middle), middle, None
-        if nodes.friction is not None:
-            change = nodes.friction(self, middle, dt * inner, 2 * q2)
+        if nodes.inner is not None:
+            change = nodes.inner.friction(self, middle, dt * inner, 2 * q2)
             middle, friction = middle + change, q1 / q2 * change
         later_pull = (middle - inertial) / length  # f_γ/m, with viscosity and friction, by the stage's own equation
         inertial = v0 + dt * (q0 * pull + q1 * later_pull + g)

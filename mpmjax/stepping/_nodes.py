@@ -1,6 +1,5 @@
 """The nodes at the start of a step: P2G, then boundaries and contacts, then the fold at mirror planes."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from typing import Any, NoReturn
@@ -42,8 +41,7 @@ class Nodes(eqx.Module):
     """The number of the boundary that brings each contact; None for that of two bodies."""
     loose: "Nodes | None" = None  # the nodes before the constraints of bodies; None without any
     tied: tuple[AbstractLayerImage, ...] = ()  # the maps of these constraints
-    friction: Callable[..., NodeVector] | None = None
-    """The friction of contacts in an inner stage (see `StageFriction`); None without contacts."""
+    inner: Any = None  # the contacts in an inner stage, a `StageContact`; None without contacts
 
     @property
     def occupied(self) -> Bool[Array, "n 1"]:
