@@ -215,7 +215,7 @@ class ConstrainedNodes(eqx.Module):
         return self.unconstrained.potential.displaced(self.displacement)
 
     def at(self, share: Scalar) -> "ConstrainedNodes":
-        """The same with surfaces where they are after a share of the step."""
+        """These nodes with surfaces where they are after a share of the step."""
         contacts = tuple(contact.at(share) for contact in self.unconstrained.contacts)
         return replace(self, unconstrained=replace(self.unconstrained, contacts=contacts))
 
