@@ -284,7 +284,7 @@ def cylinder() -> None:
         plates = [mpm.SymmetryPlane(axis, 0.0) for axis in range(3)]
         plates.append(mpm.SymmetryPlane(1, high * dx, keep="below", motion=motion))
         grid = mpm.Grid((2 * cells + 6, high + 6, 2 * cells + 6), dx, origin=(-cells - 3, -3, -cells - 3))
-        region = mpm.Cylinder((0.0, 0.0, 0.0), (0.0, high * dx, 0.0), radius)
+        region = mpm.geometry.Cylinder((0.0, 0.0, 0.0), (0.0, high * dx, 0.0), radius)
         whole = mpm.fill(region, grid, particles_per_cell=8, density=1e3)
         quarter = np.asarray((whole.x[:, 0] > 0) & (whole.x[:, 2] > 0))
         silicone = mpm.Particles(whole.x[quarter], whole.v[quarter], whole.mass[quarter], whole.volume[quarter])
@@ -292,7 +292,7 @@ def cylinder() -> None:
         area = float(silicone.volume.sum()) / (high * dx)
         times = np.linspace(0.2, 0.95, 16)
         force = -pressed(mpm.NeoHookean(3e5, 0.45), 1 - 0.2 * times, area)  # up, on the plate
-        seen = mpm.Force(times, np.stack([0 * force, force, 0 * force], axis=1), boundary=3, sigma=0.01)
+        seen = mpm.fitting.Force(times, np.stack([0 * force, force, 0 * force], axis=1), boundary=3, sigma=0.01)
         scene = mpm.Scene(
             grid,
             mpm.NeoHookean(2e5, 0.45),
