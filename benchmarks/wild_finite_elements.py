@@ -3,10 +3,9 @@
     python benchmarks/wild_finite_elements.py [--only plate,bar] [--draws 2]
 
 A cantilever that begins to sag, of one and of two layers, and a short one that is thrown; a plate with a hole that
-starts stretched and spinning; a
-block that falls on a corner, and springs back from a smooth floor; in three dimensions a bar, held at its foot, that
-starts with a twist. Noise, starts and the lines are those of `wild_closed_forms.py`; Poisson's ratio is fitted too
-where it is named.
+starts stretched and spinning; a block that falls on a corner, and springs back from a smooth floor; in three dimensions
+a bar, held at its foot, that starts with a twist. Noise, starts and the lines are those of `wild_closed_forms.py`;
+Poisson's ratio is fitted too where it is named.
 """
 
 from collections.abc import Callable
