@@ -81,7 +81,9 @@ def _keep_programs() -> None:
         folder = caches / "mpmjax" / hashlib.sha256(kind).hexdigest()[:8]
         folder.mkdir(parents=True, exist_ok=True)
         settings = {"JAX_COMPILATION_CACHE_DIR": str(folder), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-        os.environ.update({**settings, "TF_CPP_MIN_LOG_LEVEL": "3", **os.environ})  # the user's own hold
+        os.environ.update({**settings, **os.environ})  # the user's own hold
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":  # or is what JAX set in a process that starts this one
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # else XLA names features at each program that it takes from there
 
 
 def _require(condition: Any, message: str) -> None:

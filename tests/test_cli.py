@@ -164,14 +164,15 @@ print(sorted({{"jax", "numpy", "h5py", "mpmjax.cli"}} & set(sys.modules)))
 
 @pytest.mark.thorough
 def test_the_shell_keeps_compiled_programs(tmp_path):
-    """For the next command on such a processor."""
+    """For the next command on such a processor, which takes them without a word, started by a program with JAX too."""
     (tmp_path / "scene.toml").write_text(SCENE)
-    command = [sys.executable, "-m", "mpmjax", "run", "scene.toml", "--quiet"]
+    command = [sys.executable, "-m", "mpmjax", "run", "scene.toml", "--quiet", "--overwrite"]
     places = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
-    places["XDG_CACHE_HOME"] = str(tmp_path)
-    ran = subprocess.run(command, cwd=tmp_path, env=places, capture_output=True, text=True, check=True)
-    assert ran.stderr == ""
-    assert list(tmp_path.glob("mpmjax/*/jit_integrate-*"))
+    places |= {"XDG_CACHE_HOME": str(tmp_path), "TF_CPP_MIN_LOG_LEVEL": "1"}  # as JAX sets it when imported
+    for _ in range(2):
+        ran = subprocess.run(command, cwd=tmp_path, env=places, capture_output=True, text=True, check=True)
+        assert ran.stderr == ""
+        assert list(tmp_path.glob("mpmjax/*/jit_integrate-*"))
 
 
 def test_help_names_the_colours():

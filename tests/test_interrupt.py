@@ -79,6 +79,12 @@ def begun(tmp_path) -> Iterator[Callable[..., subprocess.Popen]]:
         process.communicate()
 
 
+def finish(process: subprocess.Popen) -> None:
+    """Once the process has ended without a fault; `wait` does not read what it says, and a full pipe stops it."""
+    _, err = process.communicate()
+    assert process.returncode == 0, err
+
+
 def ended(process: subprocess.Popen, number: signal.Signals) -> str:
     """The line that the process ends with when it gets the signal."""
     process.send_signal(number)
@@ -115,7 +121,7 @@ def test_a_signal_ends_a_run_at_any_moment(begun, tmp_path):
     """From the first import to the summary, whole files every time."""
     path, scene = tmp_path / "run.h5", SCENE.replace("1e4\ndt", "0.2\ndt")
     begin = time.perf_counter()
-    assert begun("run", "scene.toml", "-o", "run.h5", scene=scene).wait() == 0
+    finish(begun("run", "scene.toml", "-o", "run.h5", scene=scene))
     whole, seconds = mpm.load(path), time.perf_counter() - begin
     for i in range(10):
         path.unlink(missing_ok=True)
@@ -161,8 +167,7 @@ def test_a_signal_ends_a_fit_with_the_best_so_far(begun, tmp_path):
     (tmp_path / "front.csv").write_text("t,x\n0.5,0.361\n1.0,0.334\n1.5,0.318\n2.0,0.326\n2.5,0.340\n")
     scene = SCENE.replace("1e4\ndt", "2.5\ndt").replace("dt = 1e-3", "dt = 2e-4")
     scene += FIT.replace("[fit]\n", "[fit]\ndiscretisation = false\n")
-    whole = begun("fit", "scene.toml", "--plot", "whole.png", scene=scene)
-    assert whole.wait() == 0, whole.communicate()
+    finish(begun("fit", "scene.toml", "--plot", "whole.png", scene=scene))
 
     def signalled(number, *options):
         """A fit that gets a signal after the first iteration that it tells of: its code, and what it said since."""
@@ -188,7 +193,7 @@ def test_a_signal_ends_a_fit_with_the_best_so_far(begun, tmp_path):
         assert 1 <= len(numbers["iterations"]) < len(json.loads((tmp_path / "whole.json").read_text())["iterations"])
         assert (tmp_path / "scene_fit.png").stat().st_size > 10_000
     signalled(signal.SIGKILL, "--log", "fit.h5", "--resume")
-    assert begun("fit", "scene.toml", "--log", "fit.h5", "--resume", scene=scene).wait() == 0
+    finish(begun("fit", "scene.toml", "--log", "fit.h5", "--resume", scene=scene))
     assert (tmp_path / "scene_fit.json").read_text() == (tmp_path / "whole.json").read_text()
 
 
