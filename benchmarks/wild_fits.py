@@ -6,11 +6,11 @@
 Motions of a square by an MLS-MPM in NumPy (`peers/numpy_mpm.py`) on a grid `--finer` times as fine as the fit's:
 stretched, sheared or twisted as it starts, dropped on a floor, slumping on one that holds it, as two elastic solids;
 stretched for four periods; of a disc that is dropped (fitted once more with the floor's height), a tower that sways, an
-L that spins and stretches; a fluid and sand that collapse. By closed forms: a standing wave, a bar that vibrates, a
-block that is pressed. Markers (of the press force and width) are seen with noise of 1 % of the amplitude. `mpm.fit`
-finds E and ν (E alone of wave and bar, the viscosity, the friction angle), from starts within half a decade, as it does
-by default; with --one-grid it does not look at twice the spacing; with --refine `fit_refined` fits on twice as many
-cells too.
+L, a ring and a cross that spin and stretch, a plank that bends; a fluid and sand that collapse. By closed forms: a
+standing wave, a bar that vibrates, a block that is pressed. Markers (of the press force and width) are seen with noise
+of 1 % of the amplitude. `mpm.fit` finds E and ν (E alone of wave and bar, the viscosity, the friction angle), from
+starts within half a decade, as it does by default; with --one-grid it does not look at twice the spacing; with --refine
+`fit_refined` fits on twice as many cells too.
 
 A line a number: the truth, the estimate, its error, both intervals, and the width of the first over the error. Then,
 for all and for the motions that the rule of the intervals was not developed on, how many hold the truth.
@@ -42,10 +42,14 @@ CORNER, EVERY, GRAVITY = 0.4, 4, 9.81
 MARKERS = np.array([[a, b] for a in (0.05, 0.15, 0.25, 0.35) for b in (0.05, 0.2, 0.35, 0.5, 0.65)])
 DEVELOPED = "stretch", "shear", "bounce", "bar"
 ON_A_FLOOR, SMOOTH = ("bounce", "disc", "slump", "tower", "fluid", "sand"), ("bounce", "disc", "fluid")
+DISC = mpm.Ball((SIDE / 2, SIDE / 2), SIDE / 2)
 SHAPES: dict[str, mpm.geometry.AbstractRegion] = {
-    "disc": mpm.Ball((SIDE / 2, SIDE / 2), SIDE / 2),
+    "disc": DISC,
     "tower": mpm.Box((0.0, 0.0), (SIDE / 2, 2 * SIDE)),
     "ell": mpm.geometry.Union((mpm.Box((0.0, 0.0), (SIDE, SIDE / 2)), mpm.Box((0.0, SIDE / 2), (SIDE / 2, SIDE)))),
+    "ring": mpm.geometry.Intersection((DISC, mpm.geometry.Complement(mpm.Ball(DISC.centre, SIDE / 4)))),
+    "cross": mpm.geometry.Union((mpm.Box((0.1, 0.0), (0.3, SIDE)), mpm.Box((0.0, 0.1), (SIDE, 0.3)))),
+    "plank": mpm.Box((0.0, 0.0), (SIDE / 4, 1.75 * SIDE)),
 }
 Build = Callable[[int], mpm.Experiment]
 
@@ -78,14 +82,16 @@ def start(scene: str, x: Any) -> Any:
         return 0.8 * jnp.stack([-jnp.cos(s[:, 0]) * jnp.sin(s[:, 1]), jnp.sin(s[:, 0]) * jnp.cos(s[:, 1])], axis=1)
     if scene == "tower":
         return jnp.stack([1.5 * (jnp.asarray(x)[:, 1] / (2 * SIDE)) ** 2, 0 * s[:, 1]], axis=1)
-    if scene == "ell":
+    if scene == "plank":
+        return jnp.stack([0.6 * (jnp.sin(jnp.pi * jnp.asarray(x)[:, 1] / (1.75 * SIDE)) - 2 / jnp.pi), 0 * s[:, 1]], 1)
+    if scene in ("ell", "ring", "cross"):
         return s / jnp.pi * SIDE @ jnp.asarray([[1.5, 2.0], [-2.0, -1.0]])
     return jnp.zeros_like(s) - jnp.asarray([0.0, 1.2 if scene in ("bounce", "disc") else 0.0])
 
 
 def steps_of(scene: str) -> int:
     """Steps of a fit's run; what flows takes longer, and a vibration of some periods."""
-    return STEPS * {"fluid": 2, "sand": 2, "disc": 2, "tower": 4, "vibration": 4}.get(scene, 1)
+    return STEPS * {"fluid": 2, "sand": 2, "disc": 2, "tower": 4, "plank": 4, "vibration": 4}.get(scene, 1)
 
 
 def region(scene: str) -> mpm.geometry.AbstractRegion:
