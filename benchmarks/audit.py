@@ -73,9 +73,11 @@ def settled(
     cells: int = 8,
     crossed: float = 0.0,
     per_cell: int = 4,
+    **choices: Any,
 ) -> str:
     """A vessel that starts in its exact state, so many cells wide and half as deep, with walls at so many spacings from
-    a node, in steps of so many times the explicit limit; it moves sideways by so many spacings."""
+    a node, in steps of so many times the explicit limit; it moves sideways by so many spacings; with choices of the
+    scene."""
     dx, wide, deep, low = 1 / 16, cells / 16, cells / 32, at / 16
     load = WATER * G * deep
     grid = mpm.Grid((cells + 10, cells + 12), dx, origin=(-4, -4))
@@ -84,7 +86,7 @@ def settled(
     way = (crossed * dx, 0.0)
     motion = mpm.Motion((0.0, seconds), ((0.0, 0.0), way)) if crossed else None
     water = dataclasses.replace(water, v=water.v + jnp.asarray(way) / seconds)
-    scene = mpm.Scene(grid, law, gravity=(0.0, -G), boundary=walls_of(kind, low, low + wide, motion))
+    scene = mpm.Scene(grid, law, gravity=(0.0, -G), boundary=walls_of(kind, low, low + wide, motion), **choices)
     F, history = squeezed(law, np.asarray(WATER * G * (deep + low - water.x[:, 1])))
     volume = water.volume / law.measure.determinant(F)
     stored = jnp.moveaxis(F, -1, 0)
@@ -120,13 +122,40 @@ def rest(cells: int = 8) -> None:
 
 
 def long() -> None:
-    """The same for longer, 16 by 8 cells, at 20 times the limit: particles near the knots of the kernel stir."""
-    print("\nthe same, 16 by 8 cells, after 10 s: wall, particles a cell")
-    law = mpm.Fluid(2e5)
-    cases = [(kind, 0.25, 4) for kind in ("SlipBox", "SeparatingBox")]
-    cases += [("SlipBox", at, n) for at, n in ((0.1, 4), (0.2, 4), (0.3, 4), (0.4, 4), (0.25, 9), (0.25, 16))]
-    for kind, at, per_cell in cases:
-        print(f"{kind:>14} {per_cell:2}", settled(law, kind, at, 20.0, 10.0, 16, per_cell=per_cell), flush=True)
+    """The same for longer: particles near nodes and knots of the kernel stir by the default gradient."""
+    print("\nthe same, 16 by 8 cells, after 10 s: wall, gradient, particles a cell")
+    law, spline = mpm.Fluid(2e5), mpm.SplineGradient()
+    cases: list[tuple[Any, ...]] = [(kind, 0.25, None, 4) for kind in ("SlipBox", "SeparatingBox")]
+    cases += [("SlipBox", at, None, 4) for at in (0.1, 0.2, 0.3, 0.4)]
+    cases += [("SlipBox", 0.25, None, 9), ("SlipBox", 0.25, None, 16)]
+    cases += [(kind, 0.25, spline, 4) for kind in ("SlipBox", "SeparatingBox")] + [("SlipBox", 0.1, spline, 4)]
+    for kind, at, gradient, per_cell in cases:
+        row = settled(law, kind, at, 20.0, 10.0, 16, per_cell=per_cell, gradient=gradient)
+        print(f"{kind:>14} {'spline' if gradient else 'default':>7} {per_cell:2}", row, flush=True)
+    print(
+        "the force of a uniform pressure p, in p ∂²u/∂x², in a displacement that keeps volume: lattice by its distance"
+    )
+    print("from the nodes [spacings], particles along a cell, moving least squares, spline")
+    for n, s in ((n, s) for n in (2, 3, 4) for s in (0.0, 0.1, 0.25)):
+        print(
+            f"{s:5.2f} {n} | {still_force(s, n, least_squares=True):7.3f} {still_force(s, n, least_squares=False):7.3f}"
+        )
+
+
+def still_force(shift: float, count: int, *, least_squares: bool) -> float:
+    """½ Σ_p V ∂g/∂x x² − (Σ_p V g x) (Σ_p V w' y) of node 0 for particles V = 1/count apart and u_x = x²/2, u_y = −x y,
+    in spacings: the force on it over p, which is zero where sums are integrals."""
+
+    def weight(y: jax.Array) -> jax.Array:
+        a = jnp.abs(y)
+        return jnp.where(a < 0.5, 0.75 - a**2, jnp.where(a < 1.5, (1.5 - a) ** 2 / 2, 0))
+
+    slope = jax.vmap(jax.grad(weight))
+    g = (lambda y: -4 * y * weight(y)) if least_squares else slope
+    x = shift + 1e-9 + jnp.arange(-3 * count, 3 * count + 1) / count  # off the knots, where the slope has a kink
+    small = 1e-6
+    along = (g(x + small * x**2 / 2) - g(x - small * x**2 / 2)).sum() / (2 * small) / count
+    return float(along - (x * g(x)).sum() * (x * slope(x)).sum() / count**2)
 
 
 def down() -> None:
