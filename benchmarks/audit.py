@@ -136,7 +136,7 @@ def long() -> None:
         "the force of a uniform pressure p, in p ∂²u/∂x², in a displacement that keeps volume: lattice by its distance"
     )
     print("from the nodes [spacings], particles along a cell, moving least squares, spline")
-    for n, s in ((n, s) for n in (2, 3, 4) for s in (0.0, 0.1, 0.25)):
+    for n, s in ((n, s) for n in (2, 3, 4) for s in (0.0, 0.1, 0.15, 0.25)):
         print(
             f"{s:5.2f} {n} | {still_force(s, n, least_squares=True):7.3f} {still_force(s, n, least_squares=False):7.3f}"
         )
