@@ -15,7 +15,7 @@ from test_boundary_forces import METHODS, angular_momentum, axial, shaken
 import mpmjax as mpm
 from mpmjax.boundary import constrain
 from mpmjax.cli._scene_file import read_scene_file
-from mpmjax.geometry import surface_pieces
+from mpmjax.geometry import Complement, Cylinder, Intersection, Placed, Union, surface_pieces
 from mpmjax.io._schema import decode, encode
 from mpmjax.stepping import start_nodes
 
@@ -80,7 +80,7 @@ def test_surfaces_are_closed_and_have_their_area(region, area, volume):
     for spacing in (1 / 4, 1 / 8):
         found = surface_pieces(region, spacing)
         middle, areas = found.middle, found.area
-        assert np.abs(areas.sum(axis=0)).max() < (1e-12 if not isinstance(region, mpm.geometry.Cylinder) else 1e-2)
+        assert np.abs(areas.sum(axis=0)).max() < (1e-12 if not isinstance(region, Cylinder) else 1e-2)
         found = np.sqrt((areas**2).sum(axis=1)).sum() / area, (middle * areas).sum() / region.dim / volume
         errors.append(np.abs(np.array(found) - 1))
     if isinstance(region, mpm.Box):
@@ -88,6 +88,47 @@ def test_surfaces_are_closed_and_have_their_area(region, area, volume):
     else:
         assert (errors[1] < 1e-2).all()
         assert (np.log2(errors[0] / errors[1]) > 1.8).all()
+
+
+def without(body, hole):
+    return Intersection((body, Complement(hole)))
+
+
+PLATE, DISK, HALF = mpm.Box((-0.4, -0.3), (0.4, 0.3)), mpm.Ball((0.33, 0.017), 0.2), np.arccos(0.07 / 0.2)
+DISKS = mpm.Ball((0.013, 0.021), 0.3), mpm.Ball((0.293, 0.231), 0.25)  # 0.35 m apart, as the balls are
+BALLS = mpm.Ball((0.01, 0.02, 0.03), 0.3), mpm.Ball((0.22, 0.188, 0.254), 0.25)
+LARGE, SMALL = (np.arccos((0.35**2 + sign * 0.0275) / (0.7 * radius)) for sign, radius in ((1, 0.3), (-1, 0.25)))
+CAPS = 2 * np.pi * 0.09 * (1 - np.cos(LARGE)), 2 * np.pi * 0.0625 * (1 - np.cos(SMALL))
+NOTCHED = 2.8 - 0.4 * np.sin(HALF) + 0.4 * (np.pi - HALF)
+ROD, NEXT = (Cylinder((0.01, 0.02, z), (0.01, 0.02, z + 0.3), 0.2) for z in (0.0, 0.2))
+BOXES = mpm.Box((-0.41, -0.3), (0.11, 0.07)), mpm.Box((-0.05, -0.3), (0.4, 0.31)), mpm.Box((0.4, -0.1), (0.5, 0.1))
+HOLES, CORNER = Union((DISK, mpm.Ball((-0.1, 0.02), 0.13))), mpm.Box((-0.45, 0.1), (-0.3, 0.42))
+
+
+@pytest.mark.parametrize(
+    ("region", "area", "error"),
+    [
+        (Union(BOXES), 3.04, 0.0),
+        (Union(DISKS), 0.6 * (np.pi - LARGE) + 0.5 * (np.pi - SMALL), 0.6),
+        (Union((DISK, DISK)), 0.4 * np.pi, 0.8),
+        (Placed(without(PLATE, DISK), rotation=0.4, displacement=(0.03, 0.02)), NOTCHED, 0.6),
+        (Union((without(PLATE, HOLES), CORNER)), NOTCHED + 0.26 * np.pi + 0.34, 0.6),
+        *thorough(
+            (Union((PLATE, DISK)), 2.8 + 0.4 * (HALF - np.sin(HALF)), 0.6),
+            (Union(BALLS), 0.61 * np.pi - sum(CAPS), 2.0),
+            (without(*BALLS), 0.36 * np.pi - CAPS[0] + CAPS[1], 2.0),
+            (without(mpm.Box((-0.4, -0.3, 0.03), (0.4, 0.3, 0.23)), ROD), 1.52, 2.0),
+            (Union((ROD, mpm.Ball((0.01, 0.02, 0.3), 0.2))), 0.24 * np.pi, 2.0),
+            (Union((ROD, NEXT)), 0.28 * np.pi, 2.0),
+        ),
+    ],
+)
+def test_what_is_composed_has_the_surface_of_its_parts_to_second_order(region, area, error):
+    """Also at edges that are not convex, where parts continue each other and where they lie on each other; of boxes to
+    rounding. The error is in parts of the area, over the spacing squared [1/m²]."""
+    for spacing in (1 / 20, 1 / 40, *([1 / 80] if region.dim == 2 else [])):
+        pieces = surface_pieces(region, spacing)
+        assert abs(pieces.size.sum() / area - 1) < error * spacing**2 + 1e-12
 
 
 @pytest.mark.parametrize(

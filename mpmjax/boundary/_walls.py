@@ -125,6 +125,9 @@ class StickyBox(AbstractHoldingBox):
 
     A fluid is held by columns of nodes, as in a `SlipBox`.
 
+    *When it breaks*: in a corner nothing can move, so that a fluid's volume stays there what it was: let down, its
+    pressure in the corner's cell is half of what it should be. What `analysis.smoothed` makes of it is right.
+
     Args:
         lower: position of the lower wall in each direction [m], (d,); −inf for none.
         upper: position of the upper wall in each direction [m], (d,); inf for none.

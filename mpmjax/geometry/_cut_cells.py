@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float
+from mpmjax._types import Array, Bool, Float
 from mpmjax.checks import canonical, require, require_memory
 from mpmjax.geometry._region import AbstractRegion
 
@@ -17,6 +17,7 @@ _BATCH = 4096  # points that are computed together: one compiled program serves 
 _HALVINGS = 2
 """How often a cell that the surface cuts is halved in each direction, before the surface is taken as a plane."""
 _LINES = 4  # lines across a cell, in each direction, along which the plane is cut
+_FAR = 1e30  # what a distance without end counts as, so that differences are numbers
 _ON_IT = 1e-9  # distance within which a point is on a surface, in spacings
 _ROUNDINGS = 8.0  # the least such distance, in roundings of the greatest coordinate
 
@@ -44,6 +45,18 @@ def _distance_and_gradient(
 @eqx.filter_jit
 def _sides_of(region: AbstractRegion, x: Float[Array, "m d"]) -> tuple[Float[Array, "m k"]]:
     return (region.sides(x),)
+
+
+@eqx.filter_jit
+def _joined(region: AbstractRegion, behind: Float[Array, "m k"]) -> tuple[Bool[Array, "m"]]:
+    return (region.joined(behind > 0),)
+
+
+@eqx.filter_jit
+def _sides_and_slopes(
+    region: AbstractRegion, x: Float[Array, "m d"]
+) -> tuple[Float[Array, "m k"], Float[Array, "m k d"]]:
+    return region.sides(x), jax.vmap(jax.jacfwd(lambda at: region.sides(at[None])[0]))(x)
 
 
 def inside_parts(region: AbstractRegion, centres: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -148,9 +161,8 @@ def surface_pieces(
 ) -> Pieces:
     """The surface of a region between two corners, by marching simplices: each cube of a lattice is divided into d!
     simplices (H. W. Kuhn, IBM J. Res. Dev. 4 (1960) 518, doi 10.1147/rd.45.0518). Each of the region's `sides` is taken
-    as linear in each simplex and clipped by the others, and by those of `within`. Second order in the spacing; exact of
-    boxes, and of the parts of them in a box; of first order at edges of a `Complement` and where parts of a `Union`
-    meet, which are cut off.
+    as linear in each simplex and cut along the others, and those of `within`. Second order in the spacing, also at the
+    edges of what is composed; exact of boxes, and of the parts of them in a box.
 
     Args:
         region: whose surface.
@@ -183,8 +195,7 @@ def surface_pieces(
         parts = [_cut(*corners) for corners in _simplices(points, values[:, side].reshape(counts))]
         corners, outward = (np.concatenate(part) for part in zip(*parts, strict=True))
         pieces = _sized(Pieces(corners, outward, np.ones(len(corners), bool)), spacing)
-        pieces = _clipped(pieces, region, near, but=side)
-        of_sides.append(pieces if within is None else _clipped(pieces, within, near))
+        of_sides.append(_bounding(pieces, side, region, within, near))
     return _sized(Pieces(*(np.concatenate(part) for part in zip(*of_sides, strict=True))), spacing)
 
 
@@ -197,7 +208,17 @@ def _sized(pieces: Pieces, spacing: float) -> Pieces:
 def _sides(region: AbstractRegion, x: np.ndarray, near: float) -> np.ndarray:
     """The region's `sides` at points x [m], shape (m, d), shape (m, k); zero where they are not more than `near`."""
     (distance,) = _batched(_sides_of, region, x)
-    return np.where(np.abs(distance) <= near, 0, distance)
+    return _rounded(distance, near)
+
+
+def _holds(region: AbstractRegion, behind: np.ndarray) -> np.ndarray:
+    """Whether points lie in a region, shape (m,), by whether each is behind each of its `sides`, shape (m, k)."""
+    (joined,) = _batched(_joined, region, behind)
+    return joined > 0
+
+
+def _rounded(distance: np.ndarray, near: float) -> np.ndarray:
+    return np.where(np.abs(distance) <= near, 0, np.clip(distance, -_FAR, _FAR))
 
 
 def _simplices(points: np.ndarray, values: np.ndarray):
@@ -238,24 +259,57 @@ def _cut(corners: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.concatenate(simplices), np.concatenate(directions)
 
 
-def _clipped(pieces: Pieces, region: AbstractRegion, near: float, but: int | None = None) -> Pieces:
-    """The parts of pieces in a region, one of whose sides may be left out."""
-    d = pieces.normal.shape[1]
-    for side in range(_sides(region, np.zeros((1, d)), near).shape[1]):
-        if side == but:
-            continue
-        values = _sides(region, pieces.corners.reshape(-1, d), near)[:, side].reshape(-1, d)
-        pieces = pieces._replace(inner=pieces.inner & (values != 0).any(axis=1))
-        corners, values, within = _sorted(pieces.corners, values)
-        clipped = [pieces.of(within == d)]
+def _bounding(pieces: Pieces, side: int, region: AbstractRegion, within: AbstractRegion | None, near: float) -> Pieces:
+    """The parts of the pieces of one side of a region that bound it, in another region.
+
+    Corners are moved onto the side; then pieces are cut along all other sides, which are linear in each. A part is on
+    the surface if the region holds what is behind it and not what is before it, and inside of `within` if that holds
+    both. A side on which all of a piece lies divides the two; of several that face alike the first has the piece.
+    """
+    m, d, _ = pieces.corners.shape
+    both = (region,) if within is None else (region, within)
+    x = pieces.corners.reshape(-1, d)
+    each = [_batched(_sides_and_slopes, other, x) for other in both]
+    values, slopes = (np.concatenate(part, axis=1) for part in zip(*each, strict=True))
+    values = _rounded(values, near)
+    step = -(values[:, side] / np.maximum((slopes[:, side] ** 2).sum(axis=1), 0.25))[:, None] * slopes[:, side]
+    values = _rounded(values + (slopes * step[:, None]).sum(axis=2), near)
+    values[:, side] = 0
+    corners, values = (x + step).reshape(m, d, d), values.reshape(m, d, slopes.shape[1])
+    area = _area(corners)
+    area *= np.sign((area * pieces.normal).sum(axis=1, keepdims=True))
+    alike = np.einsum("ma,mka->mk", area, slopes.reshape(m, d, *slopes.shape[1:]).sum(axis=1)) > 0
+    flat = (values == 0).all(axis=1)
+
+    points, piece = np.concatenate([corners, values], axis=2), np.arange(m)
+    for column in range(d, points.shape[2]):
+        points, piece = _split(points, piece, column)
+    behind, flat, alike = points[:, :, d:].mean(axis=1) <= 0, flat[piece], alike[piece]
+    places = np.where(flat, alike, behind), np.where(flat, ~alike, behind)  # behind each piece, and before it
+    k = each[0][0].shape[1]
+    here, there = (_holds(region, place[:, :k]) for place in places)
+    bounds, inner = here & ~there & ~(flat & alike)[:, :side].any(axis=1), np.ones(len(points), bool)
+    if within is not None:
+        here, there = (_holds(within, place[:, k:]) for place in places)
+        bounds, inner = bounds & (here | there), here & there
+    return Pieces(points[:, :, :d], area[piece], inner).of(bounds)
+
+
+def _split(points: np.ndarray, piece: np.ndarray, column: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners with linear fields, in columns, of pieces that are cut where a field is zero, and the pieces' numbers."""
+    d, values = points.shape[1], points[:, :, column]
+    cut = (values > 0).any(axis=1) & (values < 0).any(axis=1)
+    parts, numbers = [points[~cut]], [piece[~cut]]
+    for sign in (1, -1):
+        corners, heights, within = _sorted(points[cut], sign * values[cut])
         for count in range(1, d):
-            rows = np.flatnonzero(within == count)
+            rows = within == count
             for last in range(count):  # the corners inside up to it, and the crossings from it on
                 edges = [(i, i) for i in range(last + 1)]
                 edges += [(i, j) for i in range(last, count) for j in range(count, d)]
-                clipped.append(pieces.of(rows)._replace(corners=_crossings(corners[rows], values[rows], edges)))
-        pieces = Pieces(*(np.concatenate(part) for part in zip(*clipped, strict=True)))
-    return pieces
+                parts.append(_crossings(corners[rows], heights[rows], edges))
+                numbers.append(piece[cut][rows])
+    return np.concatenate(parts), np.concatenate(numbers)
 
 
 def _sorted(corners: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -47,9 +47,14 @@ class AbstractRegion(eqx.Module):
         return self.distance(x) <= margin
 
     def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
-        """Functions of points x [m], shape (m, d), none of which is positive in the region, shape (m, k): the distances
-        from the smooth surfaces that bound it, where these meet in edges. Default: the signed distance alone."""
+        """The signed distances of points x [m], shape (m, d), from the smooth surfaces that bound it and meet in edges,
+        shape (m, k). Default: its own alone."""
         return self.distance(x)[:, None]
+
+    def joined(self, behind: Bool[Array, "m k"]) -> Bool[Array, "m"]:
+        """Whether points lie in the region, shape (m,), by whether each is behind each of its `sides`, shape (m, k).
+        Default: where it is behind all of them."""
+        return behind.all(axis=1)
 
     def fitted(self, size: np.ndarray) -> Cells | None:
         """Centroids [m], (m, d), and volumes [m^d], (m,), of cells that fill the region to its surface, near `size` in
