@@ -109,6 +109,30 @@ def test_stiffness_that_jumps_within_a_cell_is_told_of(upper, lower, gap, scene,
 
 
 @pytest.mark.parametrize("d", [2, 3])
+def test_a_fluid_that_its_pressure_stirs_is_told_of(d):
+    """On a lattice near nodes and knots of the quadratic kernel, in two directions, by moving least squares."""
+    grid, fluid = mpm.Grid((12,) * d, 0.1, origin=(-3,) * d), mpm.Fluid(2e5)
+    spline, viscous = {"gradient": mpm.SplineGradient()}, mpm.Viscous(fluid, 10.0)
+    for at, each, law, options, told in (
+        ((0.25,) * d, 2, fluid, {}, True),
+        ((0.1, *[0.25] * (d - 1)), 2, fluid, {}, True),
+        ((0.1,) * d, 2, fluid, {}, False),
+        ((0.25, *[0.0] * (d - 1)), 2, fluid, {}, False),
+        ((0.25,) * d, 2, fluid, spline, False),
+        ((0.25,) * d, 2, fluid, {"kernel": mpm.BSpline(3)}, False),
+        ((0.25,) * d, 2, viscous, {}, False),
+        ((0.25,) * d, 2, LAWS["neo_hookean"], {}, False),
+        *(((s,) * d, each, fluid, {}, False) for s in (0.0, 0.125, 0.25) for each in (3, 4)),
+    ):
+        lower = 0.1 * np.asarray(at)
+        water = mpm.fill(mpm.Box(lower, lower + 0.4), grid, particles_per_cell=each**d, density=1e3)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            mpm.prepare(mpm.Scene(grid, law, **options), water)
+        assert [bool(re.search("its pressure stirs it", str(w.message))) for w in said] == [True] * told
+
+
+@pytest.mark.parametrize("d", [2, 3])
 def test_a_body_thinner_than_two_cells_is_told_of(d):
     """But not one that fills what lies between walls or planes, or the period."""
     thin = [1.9 * 0.1, *[0.3] * (d - 1)]

@@ -16,7 +16,7 @@ import numpy as np
 from mpmjax._types import Array, Bool, Float, Int, ParticleVector
 from mpmjax.boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.checks import warn
-from mpmjax.discretisation import BSpline, Grid
+from mpmjax.discretisation import BSpline, Grid, MLSGradient
 from mpmjax.material import AbstractLaw
 from mpmjax.state._particles import Particles
 from mpmjax.state._scene import Scene
@@ -30,6 +30,7 @@ _THIN = 2.0  # a body thinner than so many cells is not resolved
 _MOST_ROUNDING = 2.0**-12
 """Rounding of positions, in spacings, up to which it is not warned of: some 2 000 cells from zero in float32."""
 _CONTRAST = 100  # ratio of moduli within a cell from which it is warned of
+_NEAR_KNOTS = 0.16  # distances to nodes or middles between them, of two directions together, in spacings
 
 
 def warn_of_setup(scene: Scene, particles: Particles) -> None:
@@ -78,6 +79,8 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
         which = "The body" if particles.counts is None else f"The body of material {number}"
         if rows.start < rows.stop:
             _warn_of_thinness(which, boundary, grid, x[rows], volume[rows, None] ** (1 / grid.dim) / 2)
+    if scene.kernel.order == 2 and isinstance(scene.gradient, MLSGradient):
+        _warn_of_knots(scene, particles)
     if not (total and scene.kernel.order == 1):
         _warn_of_contrast(scene, particles, there)
     warn_of_rounding(grid, particles.x)
@@ -114,6 +117,21 @@ def _warn_of_thinness(
             warn(
                 f"{which} is {thickness:.2g} cells thick in direction {axis}, and below {_THIN:g} its stiffness is the "
                 "grid's: take a smaller spacing."
+            )
+
+
+def _warn_of_knots(scene: Scene, particles: Particles) -> None:
+    """Warn of a fluid on a lattice on which sums of moving least squares leave a force of a uniform pressure (see
+    docs/notes/figures.md, "Water at rest")."""
+    for law, group in zip(scene.laws, particles.groups, strict=True):
+        halves = 2 * np.asarray(particles.x, float)[group.rows] / float(scene.grid.spacing)
+        off = np.sort(np.abs(halves - np.rint(halves)) / 2, axis=1)[:, :2]
+        inviscid = not law.measure.axes and law.viscosity is None
+        if inviscid and off.shape[1] == 2 and (off.sum(axis=1) < _NEAR_KNOTS).sum() > 0.6 * len(off) > 0:
+            warn(
+                "Particles of a fluid stand near nodes and the middles between them, where its pressure stirs it though it "
+                "is at rest, within seconds: give the scene gradient=SplineGradient(), or fill with three or four "
+                "particles along a cell."
             )
 
 
