@@ -129,8 +129,8 @@ def _warn_of_knots(scene: Scene, particles: Particles) -> None:
         inviscid = not law.measure.axes and law.viscosity is None
         if inviscid and off.shape[1] == 2 and (off.sum(axis=1) < _NEAR_KNOTS).sum() > 0.6 * len(off) > 0:
             warn(
-                "Particles of a fluid stand near nodes and the middles between them, where its pressure stirs it though it "
-                "is at rest, within seconds: give the scene gradient=SplineGradient(), or fill with three or four "
+                "Particles of a fluid stand near nodes and the middles between them, where its pressure stirs it "
+                "at rest, within seconds: give the scene gradient=SplineGradient(), or fill with three or four "
                 "particles along a cell."
             )
 
