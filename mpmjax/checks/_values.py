@@ -22,6 +22,7 @@ import lineax as lx
 import numpy as np
 
 from mpmjax._jax import Tracer
+from mpmjax._tables import shortened
 
 _UNKNOWN = 2**34  # memory assumed to be available if the system does not say [B]
 
@@ -81,12 +82,6 @@ def require(condition: Any, message: str) -> None:
             gathered.append(Requirement(message, lambda: condition))
     elif not np.all(condition):
         raise ValueError(message)
-
-
-def shortened(text: str, most: int = 80) -> str:
-    """The text in one line of at most `most` characters."""
-    text = " ".join(text[: 10 * most].split())
-    return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def require_that(what: str, holds: Callable[..., Any], *values: Any) -> None:
