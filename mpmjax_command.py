@@ -233,7 +233,7 @@ def check(
     imports: Imports = None,
 ) -> None:
     """Describe a scene: size, longest step, seconds, what looks wrong."""
-    scene_table(scene, changes or (), more=bool(imports))
+    scene_table(scene, changes or (), fit=True, more=bool(imports))
     _require_folder(plot)
     with _package(imports) as cli:
         cli.check_scene(scene, changes or (), plot)

@@ -138,6 +138,7 @@ def test_who_asks_or_errs_does_not_wait_for_jax(tmp_path):
         "run scene.toml -o a.h5 --set boundary.0.kind=Slip": "[[boundary]] 1: unknown kind 'Slip', did you mean 'SlipB",
         "run scene.toml --vary run.tt=1:2:3": "[run]: unknown key 'tt'",
         "check scene.toml --set particles.0.region.kind=Bocks": "[[particles]] 1 [region]: unknown kind 'Bocks'",
+        "check fit.toml": "[[fit.parameter]] 1: unknown key 'pth'",
         "fit fit.toml": "[[fit.parameter]] 1: unknown key 'pth', did you mean 'path'?",
         "schema": "",
         "run scene.toml -o a.h5 --import none.py": "there is no file none.py",
