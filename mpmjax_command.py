@@ -151,8 +151,10 @@ Imports = Annotated[
         help="A module, or its .py file, that registers classes of your own (mpm.register); its code is executed.",
     ),
 ]
-ScenePath = Annotated[Path, typer.Argument(help="A TOML scene file; docs/scene_files.md is its schema.")]
-RunPath = Annotated[Path, typer.Argument(help="An HDF5 file of a run.")]
+ScenePath = Annotated[
+    Path, typer.Argument(metavar="SCENE", help="A TOML scene file; docs/scene_files.md is its schema.")
+]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="An HDF5 file of a run.")]
 Changes = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change the file's key, such as grid.spacing=0.05; repeatable."),
@@ -337,7 +339,7 @@ def render(
 
 @_command
 def info(
-    path: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="An HDF5 file of a run, to describe.")] = None,
+    path: Annotated[Path | None, typer.Argument(metavar="RUN", help="An HDF5 file of a run, to describe.")] = None,
     table: Annotated[
         Path | None, typer.Option(help="A CSV file to write: energies, reactions and solver statistics of each frame.")
     ] = None,
@@ -367,7 +369,9 @@ def schema(imports: Imports = None) -> None:
 
 @_command
 def example(
-    name: Annotated[str | None, typer.Argument(help="Such as jelly. Without it they are listed.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Such as jelly. Without it they are listed.")
+    ] = None,
 ) -> None:
     """Copy an example into examples/ here, or list them."""
     here = Path(__file__).parent
