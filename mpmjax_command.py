@@ -11,7 +11,6 @@ import platform
 import re
 import signal
 import sys
-import tomllib
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +21,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from mpmjax._tables import SCHEMA, scene_table
 
 app = typer.Typer(
     help="A differentiable Material Point Method.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
@@ -122,38 +123,6 @@ def _command(command: Callable[..., None]) -> Callable[..., None]:
     return app.command()(guarded)
 
 
-def scene_table(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
-    """The table in a scene file, after changes "KEY=VALUE" with a dotted key and a value as TOML writes it (a string
-    may lack its quotes). A ValueError says in one line what is not one of these."""
-    try:
-        table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"Cannot read the scene file {path}: {str(error.strerror).lower()}.") from None
-    except RecursionError:
-        raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
-    except ValueError as error:  # TOML's and UTF-8's among them
-        text = " ".join(str(error)[:800].split())
-        raise ValueError(f"{path} is not a TOML file: {text if len(text) < 80 else text[:77] + '...'}.") from None
-    for name in ("particles", "run"):
-        _require(name in table, f"{path}: needs the table [{name}]. See docs/scene_files.md.")
-    for change in changes:
-        key, equals, text = change.partition("=")
-        _require(key and equals, f"--set must be KEY=VALUE, such as material.youngs_modulus=2e5, got {change!r}.")
-        try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            value = text
-        *owners, last = key.strip().split(".")
-        owner: Any = table
-        try:
-            for name in owners:
-                owner = owner[int(name)] if isinstance(owner, list) else owner.setdefault(name, {})
-            owner[int(last) if isinstance(owner, list) else last] = value
-        except (AttributeError, IndexError, TypeError, ValueError):
-            raise ValueError(f"{key}: {path} has no such place; tables of a list have numbers from 0.") from None
-    return table
-
-
 def _numbers_of(span: str) -> list[str]:
     """The changes KEY=VALUE of one --vary."""
     key, _, numbers = span.partition("=")
@@ -182,8 +151,10 @@ Imports = Annotated[
         help="A module, or its .py file, that registers classes of your own (mpm.register); its code is executed.",
     ),
 ]
-ScenePath = Annotated[Path, typer.Argument(help="A TOML scene file; docs/scene_files.md is its schema.")]
-RunPath = Annotated[Path, typer.Argument(help="An HDF5 file of a run.")]
+ScenePath = Annotated[
+    Path, typer.Argument(metavar="SCENE", help="A TOML scene file; docs/scene_files.md is its schema.")
+]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="An HDF5 file of a run.")]
 Changes = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change the file's key, such as grid.spacing=0.05; repeatable."),
@@ -237,7 +208,8 @@ def run(
     _require_folder(output)
     overrides = {"dt": dt, "t1": t1, "method": method}
     changed = [*(changes or ()), *(f"run.{key}={value}" for key, value in overrides.items() if value is not None)]
-    settings = scene_table(scene, changed)["run"]
+    more = bool(imports)
+    settings = scene_table(scene, changed, more=more)["run"]
     if steps is not None:
         step = settings.get("dt") if isinstance(settings, dict) else None
         known = isinstance(step, (int, float)) and steps > 0
@@ -245,7 +217,7 @@ def run(
         changed.append(f"run.t1={steps * float(step or 0)!r}")
     members = list(itertools.product(*map(_numbers_of, spans or ())))
     if spans:
-        scene_table(scene, [*changed, *members[0]])
+        scene_table(scene, [*changed, *members[0]], more=more)
         _require("auto" not in map(settings.get, ("dt", "method")), '--vary needs a method, and a step or "stable".')
         with _package(imports) as cli:
             cli.study_scene(scene, output, changed, members, quiet=quiet)
@@ -263,7 +235,7 @@ def check(
     imports: Imports = None,
 ) -> None:
     """Describe a scene: size, longest step, seconds, what looks wrong."""
-    scene_table(scene, changes or ())
+    scene_table(scene, changes or (), fit=True, more=bool(imports))
     _require_folder(plot)
     with _package(imports) as cli:
         cli.check_scene(scene, changes or (), plot)
@@ -292,7 +264,8 @@ def fit(
     What to fit says the file's [fit] table. It prints a table, and writes a picture and its numbers as JSON. Ctrl-C
     ends it after the iteration in progress, with the best so far."""
     _require(log is not None or not resume, "--resume continues the fit of a log: name it by --log.")
-    _require("fit" in scene_table(scene), f"{scene} has no [fit] table: there is nothing to fit.")
+    table = scene_table(scene, fit=True, more=bool(imports))
+    _require("fit" in table, f"{scene} has no [fit] table: there is nothing to fit.")
     plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
     _require_folder(plot)
     try:
@@ -315,7 +288,7 @@ def chart(
     imports: Imports = None,
 ) -> None:
     """Find the cheapest method and step for an error."""
-    scene_table(scene, changes or ())
+    scene_table(scene, changes or (), more=bool(imports))
     output = Path(f"{scene.stem}_chart.png") if output is None else output
     _require_folder(output)
     with _package(imports) as cli:
@@ -366,7 +339,7 @@ def render(
 
 @_command
 def info(
-    path: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="An HDF5 file of a run, to describe.")] = None,
+    path: Annotated[Path | None, typer.Argument(metavar="RUN", help="An HDF5 file of a run, to describe.")] = None,
     table: Annotated[
         Path | None, typer.Option(help="A CSV file to write: energies, reactions and solver statistics of each frame.")
     ] = None,
@@ -387,13 +360,18 @@ def schema(imports: Imports = None) -> None:
     """Print the JSON schema of scene files, for editors.
 
     Save it, and begin a scene file with the line "#:schema scene.schema.json"."""
-    with _package(imports) as cli:
-        print(json.dumps(cli.scene_schema(), indent=1))
+    if imports:
+        with _package(imports) as cli:
+            print(json.dumps(cli.scene_schema(), separators=(",", ":")))
+    else:
+        print(SCHEMA.read_text(encoding="utf-8"), end="")
 
 
 @_command
 def example(
-    name: Annotated[str | None, typer.Argument(help="Such as jelly. Without it they are listed.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Such as jelly. Without it they are listed.")
+    ] = None,
 ) -> None:
     """Copy an example into examples/ here, or list them."""
     here = Path(__file__).parent

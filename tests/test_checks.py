@@ -1,7 +1,9 @@
 """What modules require of their values: of what is known a ValueError, of what is traced a named fault."""
 
 import dataclasses
+import pickle
 import re
+import traceback
 from typing import Annotated
 
 import equinox as eqx
@@ -256,3 +258,17 @@ def test_a_mark_on_a_traced_field_is_put_off():
         return first_unmet(requirements(Marked(modulus)))
 
     assert [int(unmet(modulus)) for modulus in (1.0, -1.0, jnp.nan)] == [0, 2, 1]
+
+
+@pytest.mark.parametrize("bad", [{"dt": -1e-3}, {"dt": "long"}], ids=["value", "kind"])
+def test_a_refusal_within_jit_ends_with_its_own_line(bad):
+    """Not with JAX's note on its frames; whatever else is noted of it stays, and it passes between processes."""
+    scene = mpm.Scene(mpm.Grid((8,), 0.1), mpm.NeoHookean(1e5, 0.3))
+    particles = mpm.fill(mpm.Box((0.2,), (0.4,)), scene.grid, density=1.0)
+    step = jax.jit(lambda p: mpm.step(scene, mpm.prepare(scene, p), **{"t": 0.0, "method": mpm.Explicit()} | bad))
+    with pytest.raises(ValueError, match=r"got .*\.$|got 'long'") as refused:
+        step(particles)
+    assert traceback.format_exception(refused.value)[-1].endswith(f"InputError: {refused.value}\n")
+    refused.value.add_note("of the tenth run")
+    assert refused.value.__notes__ == ["of the tenth run"]
+    assert str(pickle.loads(pickle.dumps(refused.value))) == str(refused.value)

@@ -19,13 +19,15 @@ from disk import full_beyond
 from shell import refused, shell
 
 import mpmjax as mpm
+from mpmjax._tables import scene_table
+from mpmjax.cli import scene_schema
 from mpmjax.cli._commands import _summary
 from mpmjax.cli._fit_file import leaf_of, read_fit
 from mpmjax.cli._scene_file import read_scene_file, read_simulation
 from mpmjax.fitting._columns import read_columns
+from mpmjax.io import _schema
 from mpmjax.simulation._simulate import integrate
 from mpmjax.viz import COLOURS
-from mpmjax_command import scene_table
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SCENE = """
@@ -116,6 +118,7 @@ def test_who_asks_or_errs_does_not_wait_for_jax(tmp_path):
     imported the package, as `python -m mpmjax` does."""
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "bad.toml").write_text("[grid")
+    (tmp_path / "fit.toml").write_text(SCENE + '[fit]\n[[fit.parameter]]\npth = "a"\n')
     refusals = {
         "run none.toml -o a.h5": "Cannot read the scene file none.toml",
         "run bad.toml -o a.h5": "is not a TOML file",
@@ -130,6 +133,14 @@ def test_who_asks_or_errs_does_not_wait_for_jax(tmp_path):
         "run scene.toml --vary run.dt=1:2:3 -o a.h5": "writes a table",
         "run scene.toml --vary run.dt.x=1:2:3": "has no such place",
         "run scene.toml --vary grid.spacing=1:2:3 --method auto": "--vary needs a method",
+        "run scene.toml -o a.h5 --set grid.spacng=1": "[grid]: unknown key 'spacng', did you mean 'spacing'?",
+        "run scene.toml -o a.h5 --set material={kind='NeoHookean'}": "[material] needs the key 'youngs_modulus'",
+        "run scene.toml -o a.h5 --set boundary.0.kind=Slip": "[[boundary]] 1: unknown kind 'Slip', did you mean 'SlipB",
+        "run scene.toml --vary run.tt=1:2:3": "[run]: unknown key 'tt'",
+        "check scene.toml --set particles.0.region.kind=Bocks": "[[particles]] 1 [region]: unknown kind 'Bocks'",
+        "check fit.toml": "[[fit.parameter]] 1: unknown key 'pth'",
+        "fit fit.toml": "[[fit.parameter]] 1: unknown key 'pth', did you mean 'path'?",
+        "schema": "",
         "run scene.toml -o a.h5 --import none.py": "there is no file none.py",
         "check none.toml": "Cannot read the scene file none.toml",
         "fit scene.toml": "has no [fit] table",
@@ -180,12 +191,17 @@ def test_help_names_the_colours():
 
 
 def test_a_change_is_made_at_its_place(folder):
-    changes = ("material.youngs_modulus=2e5", "boundary.0.lower=[0.0, 0.0]", "run.method=Explicit", "volume.kind=a b")
+    changes = (
+        "material.youngs_modulus=2e5",
+        "boundary.0.lower=[0.0, 0.0]",
+        "run.method=Explicit",
+        "particles.0.material=a b",
+    )
     table = scene_table(folder / "scene.toml", changes)
     assert table["material"]["youngs_modulus"] == 2e5
     assert table["boundary"][0] == {"kind": "SlipBox", "lower": [0.0, 0.0], "upper": [0.6, np.inf]}
     assert table["run"]["method"] == "Explicit"
-    assert table["volume"] == {"kind": "a b"}
+    assert table["particles"][0]["material"] == "a b"
     assert "unknown" in refused("check", folder / "scene.toml", "--set", "grid.spacng=1")
 
 
@@ -299,12 +315,15 @@ def valid(value, schema, defs):
     return fits and ("anyOf" not in schema or any(valid(value, each, defs) for each in schema["anyOf"]))
 
 
-def test_the_schema_holds_the_examples_and_no_slip():
+def test_the_schema_holds_the_examples_and_no_slip(monkeypatch):
     """It is derived from what reads the files, so that editors know each key."""
     code, out, err = shell("schema")
     assert code == 0, err
     schema = json.loads(out)
-    assert {"Intersection", "Mesh", "NeoHookean", "Newton"} <= set(schema["$defs"])
+    monkeypatch.setattr(_schema, "_registered", {})
+    anew = "write it anew: mpmjax schema --import mpmjax > mpmjax/scene.schema.json"
+    assert out == json.dumps(scene_schema(), separators=(",", ":")) + "\n", anew
+    assert {"Intersection", "Mesh", "NeoHookean", "Newton", "Rigid", "VolumePreconditioner"} <= set(schema["$defs"])
     assert schema["$defs"]["NeoHookean"]["required"] == ["youngs_modulus", "poisson_ratio"]
     for path in EXAMPLES.glob("*.toml"):
         assert valid(tomllib.loads(path.read_text()), schema, schema["$defs"]), path

@@ -467,8 +467,8 @@ ERRORS = [
         "[[boundary]] 1 [motion]: A rigid motion's rotation must have shape (2,) here, got (1,).",
     ),
     (
-        {"boundary": [{"kind": "SlipCollider", "shape": DISC, "motion": {"times": [0], "displacement": [[0, 0]]}}]},
-        "[[boundary]] 1 [motion] needs a kind: one of Motion, RigidMotion.",
+        {"boundary": [{"kind": "SlipCollider", "shape": DISC, "motion": {"times": [0]}}]},
+        "[[boundary]] 1 [motion] needs the key 'displacement'.",
     ),
     (
         {"boundary": [{"kind": "SlipCollider", "shape": {**DISC, "centre": [0, 0, 0]}}]},

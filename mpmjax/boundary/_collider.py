@@ -24,7 +24,7 @@ from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_i
 from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import between, canonical, require, require_fields
 from mpmjax.discretisation import Grid, scatter
-from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, length, still
+from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, Motion, length, still
 from mpmjax.potential import SurfaceImage, WallImage, surface_image
 
 _ASKEW = 1e-6  # the slope to an axis up to which a half-space is across it: a turned one is so to rounding
@@ -173,7 +173,7 @@ class StickyCollider(AbstractHoldingCollider):
     """
 
     shape: AbstractRegion
-    motion: AbstractMotion | None = None
+    motion: Motion | AbstractMotion | None = None
     sticks: ClassVar[bool] = True
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
@@ -197,7 +197,7 @@ class SlipCollider(AbstractHoldingCollider):
     """
 
     shape: AbstractRegion
-    motion: AbstractMotion | None = None
+    motion: Motion | AbstractMotion | None = None
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """In the total description its normal must be the same everywhere and always."""
@@ -241,7 +241,7 @@ class SeparatingCollider(AbstractCollider):
     """
 
     shape: AbstractRegion
-    motion: AbstractMotion | None = None
+    motion: Motion | AbstractMotion | None = None
     friction: Annotated[Scalar, between(0, 1e6)] = 0.0
     pushes: ClassVar[bool] = True
 

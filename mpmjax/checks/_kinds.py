@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray
 
-from mpmjax.checks._values import shortened
+from mpmjax.checks._values import InputError, shortened
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -78,7 +78,7 @@ def require_fields(module: eqx.Module) -> None:
             hash(value if static else None)
         except TypeError:
             shown = shortened(repr(value))
-            raise ValueError(f"{what} fixes a program: give a known number or a tuple, got {shown}.") from None
+            raise InputError(f"{what} fixes a program: give a known number or a tuple, got {shown}.") from None
         require_marks(what, value, marks)
 
 
@@ -91,7 +91,7 @@ def require_kind(name: str, value: Any, hint: Any) -> None:
     """Raise a `ValueError` with the kinds that an annotation names if a value is of none, and what may be meant."""
     if not _takes(hint, value):
         shown = f"the class {value.__name__}" if isinstance(value, type) else shortened(repr(value))
-        raise ValueError(f"{name} must be {_in_words(hint)}, got {shown}{_meant(hint, value)}")
+        raise InputError(f"{name} must be {_in_words(hint)}, got {shown}{_meant(hint, value)}")
 
 
 def require_marks(name: str, value: Any, marks: list[Any]) -> None:

@@ -22,8 +22,17 @@ import lineax as lx
 import numpy as np
 
 from mpmjax._jax import Tracer
+from mpmjax._tables import shortened
 
 _UNKNOWN = 2**34  # memory assumed to be available if the system does not say [B]
+
+
+class InputError(ValueError):
+    """A `ValueError` of what a user passes in. It ends with its own line within `jax.jit` too."""
+
+    def add_note(self, note: str, /) -> None:
+        if "JAX_TRACEBACK_FILTERING" not in note:  # else JAX's, on frames of its own, would be what one reads
+            super().add_note(note)
 
 
 def is_traced(tree: Any) -> bool:
@@ -80,13 +89,7 @@ def require(condition: Any, message: str) -> None:
         if (gathered := _put_off.get()) is not None:
             gathered.append(Requirement(message, lambda: condition))
     elif not np.all(condition):
-        raise ValueError(message)
-
-
-def shortened(text: str, most: int = 80) -> str:
-    """The text in one line of at most `most` characters."""
-    text = " ".join(text[: 10 * most].split())
-    return text if len(text) <= most else text[: most - 3] + "..."
+        raise InputError(message)
 
 
 def require_that(what: str, holds: Callable[..., Any], *values: Any) -> None:
@@ -96,7 +99,7 @@ def require_that(what: str, holds: Callable[..., Any], *values: Any) -> None:
         if (gathered := _put_off.get()) is not None:
             gathered.append(Requirement(f"{what}.", lambda: holds(*map(jnp.asarray, values))))
     elif not np.all(holds(*map(np.asarray, values))):  # written only here: writing an array takes ms
-        raise ValueError(f"{what}, got {' and '.join(shortened(str(value)) for value in values)}.")
+        raise InputError(f"{what}, got {' and '.join(shortened(str(value)) for value in values)}.")
 
 
 def warn(message: str) -> None:
@@ -131,9 +134,9 @@ def require_placement(tree: Any) -> None:
             kind = jax.typeof(leaf)
             axes = getattr(kind, "manual_axis_type", None)
             if getattr(axes, "varying", getattr(kind, "vma", None)):  # the name from jax 0.10 on, and the older one
-                raise ValueError("A jax.shard_map must not check over which axes arrays vary: give it check_vma=False.")
+                raise InputError("A jax.shard_map must not check over which axes arrays vary: give it check_vma=False.")
             if any(axis is not None for axis in getattr(kind.sharding, "spec", ())):
-                raise ValueError(
+                raise InputError(
                     "Arrays must not be divided over explicit axes: make the mesh of axes of the kind "
                     "jax.sharding.AxisType.Auto, or divide them within jax.shard_map(..., check_vma=False)."
                 )
@@ -168,10 +171,10 @@ def require_positive(name: str, value: Any, dtype: Any = None) -> None:
 def require_whole(name: str, value: Any, least: int) -> int:
     """A number must be whole, known and at least so large; it may be an array's."""
     if is_traced(value):
-        raise ValueError(f"{name} must be a known number, not a traced one.")
+        raise InputError(f"{name} must be a known number, not a traced one.")
     a = np.asarray(value, dtype=float)
     if not (a.ndim == 0 and np.isfinite(a) and a == np.rint(a) and a >= least):
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {shortened(str(value))}.")
+        raise InputError(f"{name} must be a whole number of at least {least}, got {shortened(str(value))}.")
     return int(value)
 
 
@@ -179,7 +182,7 @@ def coordinates(name: str, point: Any) -> int:
     """How many coordinates a point has, one to three; it must be a plain sequence of them."""
     plain = isinstance(point, (tuple, list)) or np.ndim(point) == 1
     if not (plain and 1 <= len(point) <= 3):
-        raise ValueError(
+        raise InputError(
             f"{name} must be a sequence of one to three numbers, one a direction, got {shortened(str(point))}."
         )
     return len(point)
@@ -251,7 +254,7 @@ def require_memory(what: str, needed: float | int, advice: str, *, device: bool 
         return
     there = available_memory(device=device)
     if not needed <= there:
-        raise ValueError(
+        raise InputError(
             f"{what} takes at least {needed / 1e9:.3g} GB of memory, and {there / 1e9:.3g} GB are available: {advice}"
         )
 

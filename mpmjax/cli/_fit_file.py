@@ -10,8 +10,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from mpmjax._tables import require_keys, shortened
 from mpmjax._types import Scalar
-from mpmjax.checks import between, require, require_positive, shortened
+from mpmjax.checks import between, require, require_positive
 from mpmjax.cli._measurements import observation
 from mpmjax.cli._scene_file import Simulation, marked_arguments, read_simulation
 from mpmjax.fitting import (
@@ -24,7 +25,7 @@ from mpmjax.fitting import (
     Starts,
     Unbounded,
 )
-from mpmjax.io import decode, require_keys
+from mpmjax.io import decode
 
 
 class FitFile(NamedTuple):

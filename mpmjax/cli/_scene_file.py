@@ -12,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from mpmjax._tables import scene_table
 from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
 from mpmjax.checks import (
@@ -27,7 +28,7 @@ from mpmjax.checks import (
     whole,
 )
 from mpmjax.geometry import AbstractRegion
-from mpmjax.io import arguments, check_fields, decode, load, parameters_of, save
+from mpmjax.io import are_registered, arguments, check_fields, decode, load, parameters_of, save
 from mpmjax.simulation import number_of_steps
 from mpmjax.state import Particles, Scene, attach, fill, join, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
@@ -103,9 +104,7 @@ def load_scene(path: str | os.PathLike) -> tuple[Scene, Particles, dict[str, Any
 
 def read_scene_file(path: Path, changes: Sequence[str] = ()) -> SceneFile:
     """Read a scene file after changes to it (see `scene_table`); a ValueError says in one line what is wrong where."""
-    from mpmjax_command import scene_table  # here, since it imports the shell's parser
-
-    table = scene_table(path, changes)
+    table = scene_table(path, changes, more=are_registered())
     fit_table = table.pop("fit", None)
     require(fit_table is None or isinstance(fit_table, dict), f"{path}: [fit] must be a table.")
     _find_files(table, path.parent)

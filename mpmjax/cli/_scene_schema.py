@@ -5,13 +5,16 @@ import inspect
 from collections.abc import Callable, Iterable
 from typing import Any, get_args, get_origin
 
+from mpmjax._tables import OPEN
 from mpmjax.checks import alternatives, is_class
 from mpmjax.cli._fit_file import fit_parameter, fit_settings
 from mpmjax.cli._measurements import KINDS, keys_of
 from mpmjax.cli._scene_file import RunSettings, particles_in
 from mpmjax.fitting import AbstractOptimiser
-from mpmjax.io import MADE, classes_for, forms_of, known_classes, parameters_of, save, words_of
+from mpmjax.io import MADE, classes_for, evident_kinds, forms_of, is_open, known_classes, parameters_of, save, words_of
 from mpmjax.state import Scene, fill
+
+_EMPTY = inspect.Parameter.empty
 
 
 def scene_schema() -> dict[str, Any]:
@@ -25,8 +28,8 @@ def scene_schema() -> dict[str, Any]:
     run = _table(RunSettings)
     run["properties"]["method"]["anyOf"].append({"const": "auto"})
     fit, text = _table(fit_settings), {"type": "string"}
+    fit["properties"] = {"t1": {"type": "number"}} | fit["properties"]
     fit["properties"] |= {
-        "t1": {"type": "number"},
         "report": {"type": "object", "additionalProperties": text},
         "parameter": tables(_table(fit_parameter, without=("experiments",))),
         "observation": tables({"anyOf": [_table(keys_of(kind)[0], kind=kind) for kind in KINDS]}),
@@ -50,7 +53,7 @@ def _table(function: Callable, without: Iterable[str] = (), kind: str | None = N
     """The JSON schema of a table of a function's arguments; `kind` is its key of that name."""
     parameters = {name: p for name, p in parameters_of(function).items() if name not in without}
     properties = {name: _value(hint) for name, (hint, _) in parameters.items()}
-    required = [name for name, (_, default) in parameters.items() if default is inspect.Parameter.empty]
+    required = [name for name, (_, default) in parameters.items() if default is _EMPTY]
     text = " ".join((function.__doc__ or "").split("\n\n")[0].split())
     named = {} if kind is None else {"kind": {"const": kind}}
     table = {"type": "object", "properties": named | properties, "additionalProperties": False}
@@ -69,11 +72,13 @@ def _value(hint: Any) -> dict[str, Any]:
         for _ in range(depth):
             value = {"type": "array", "items": value}
         choices.append(value)
-    for cls in classes_for(options):
-        choices.append({"$ref": f"#/$defs/{cls.__name__}"})
-        if all(default is not inspect.Parameter.empty for _, default in parameters_of(cls).values()):
-            choices.append({"const": cls.__name__})  # its kind alone
-        choices += [{"$ref": f"#/$defs/{name}"} for name, (_, result) in MADE.items() if result is cls]
+    evident, kinds = evident_kinds(options), classes_for(options)
+    names = [cls.__name__ for cls in kinds]
+    names += [name for name, (_, result) in MADE.items() if result in kinds]
+    for name in names:
+        choices.append({"$ref": f"#/$defs/{name}"} | ({} if evident == [name] else {"required": ["kind"]}))
+    whole = {cls.__name__: parameters_of(cls).values() for cls in kinds}
+    choices += [{"const": name} for name, keys in whole.items() if all(d is not _EMPTY for _, d in keys)]  # kind alone
     for a in options:
         if get_origin(a) is dict:  # of objects by their names
             choices.append({"type": "object", "additionalProperties": _value(get_args(a)[1])})
@@ -81,4 +86,5 @@ def _value(hint: Any) -> dict[str, Any]:
             choices.append({"enum": [member.value for member in a]})
         elif get_origin(a) in (tuple, list) and (item := _value(get_args(a)[0])) and not forms_of(a):
             choices += [{"type": "array", "items": item}, item]
-    return {"anyOf": choices} if choices else {}
+    unique = [choice for i, choice in enumerate(choices) if choice not in choices[:i]]
+    return ({"anyOf": unique} if unique else {}) | ({"$comment": OPEN} if kinds and is_open(options) else {})

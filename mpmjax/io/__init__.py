@@ -5,15 +5,17 @@ from mpmjax.io._run_file import check_hdf5 as check_hdf5, check_place as check_p
 from mpmjax.io._runs import load as load, record as record, save as save, table as table
 from mpmjax.io._schema import (
     MADE as MADE,
+    are_registered as are_registered,
     arguments as arguments,
     classes_for as classes_for,
     decode as decode,
     encode as encode,
+    evident_kinds as evident_kinds,
     forms_of as forms_of,
+    is_open as is_open,
     known_classes as known_classes,
     parameters_of as parameters_of,
     register as register,
-    require_keys as require_keys,
     words_of as words_of,
 )
 from mpmjax.io._transactional_file import (

@@ -11,7 +11,6 @@ Numbers come back bit for bit. A TOML scene is such data, and so is the JSON in 
 constructors of known classes and executes nothing else.
 """
 
-import difflib
 import enum
 import inspect
 import typing
@@ -26,8 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray
 
+import mpmjax.extensions  # noqa: F401  # whose classes files hold as others
+from mpmjax._tables import are_named, kind_in, place_in_list, place_of, require_in, require_keys, short
 from mpmjax._types import MAY_BE_INFINITE, Scalar
-from mpmjax.checks import alternatives, choices, is_abstract, is_class, is_own, marks_of, require, shortened
+from mpmjax.checks import alternatives, choices, is_abstract, is_class, is_own, marks_of, require
 from mpmjax.geometry import SampledDistance, sample_mesh
 from mpmjax.state import Scene
 from mpmjax.stepping import AbstractIntegrator
@@ -61,7 +62,7 @@ def register(cls: Registered) -> Registered:
     Raises:
         ValueError: no such class, a name that another class has, or an argument that files cannot hold.
     """
-    require(is_class(cls, eqx.Module), f"register takes a class, an equinox.Module, got {_short(cls)}.")
+    require(is_class(cls, eqx.Module), f"register takes a class, an equinox.Module, got {short(cls)}.")
     name = cls.__name__
     other = next((c for c in known_classes() if c.__name__ == name), cls)
     require(
@@ -102,12 +103,29 @@ def known_classes() -> tuple[type, ...]:
     return (*saved_classes(), *_registered.values())
 
 
+def are_registered() -> bool:
+    """Whether there are classes that files can hold beside the package's."""
+    return len(_registered) > 0
+
+
 def classes_for(options: Iterable[Any]) -> list[type]:
     """The classes of an annotation's members that files can hold; of bases that no scene has, all public ones."""
     taken = tuple(a for a in options if is_class(a, eqx.Module))
     held = [c for c in known_classes() if issubclass(c, taken)]
     others = [c for a in taken if is_abstract(a) for c in choices(a).values() if is_own(c)]
     return sorted(held or others, key=lambda c: c.__name__)
+
+
+def is_open(options: Iterable[Any]) -> bool:
+    """Whether an annotation's members are open to classes that are registered."""
+    return any(map(is_abstract, options))
+
+
+def evident_kinds(options: Iterable[Any]) -> list[str]:
+    """The class of an annotation's members that a file need not name: the one that is named by itself beside base
+    classes, or the package's only one; several if none is evident."""
+    plain = [a.__name__ for a in options if is_class(a, eqx.Module) and not is_abstract(a)]
+    return plain if len(plain) == 1 else [c.__name__ for c in classes_for(options) if is_own(c)]
 
 
 def _can_be_held(hint: Any) -> bool:
@@ -186,7 +204,7 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     if any(map(_is_callable, options)) and isinstance(data, dict):
         if "kind" not in data:
             name = str(data.get("function"))
-            _require(name in _FUNCTIONS, where, f"must be a function of jax.nn or jax.numpy, got {_short(name)}")
+            require_in(where, name in _FUNCTIONS, f"must be a function of jax.nn or jax.numpy, got {short(name)}")
             return _FUNCTIONS[name]
         options = [eqx.Module]
     if isinstance(data, dict) and str(data.get("kind")).startswith("equinox.nn."):
@@ -197,36 +215,23 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         classes |= {name: make for name, (make, cls) in MADE.items() if cls.__name__ in classes}
     items = [get_args(a)[0] for a in options if get_origin(a) in (tuple, list)]
     if items and isinstance(data, list) and (classes or not forms_of(expected)):  # of objects, or of arrays
-        *outer, header = where.split(" ")  # of one of a list of tables it is that of the list in further brackets
-        nth = " ".join([*outer, f"[{header}]"])
-        return tuple(decode(d, items[0], f"{nth} {i}", arrays) for i, d in enumerate(data, 1))
+        return tuple(decode(d, items[0], place_in_list(where, i), arrays) for i, d in enumerate(data, 1))
     named = [get_args(a)[1] for a in options if get_origin(a) is dict]
-    if named and isinstance(data, dict) and data and all(isinstance(d, dict) for d in data.values()):  # of objects
-        return {name: decode(d, named[0], f"{where[:-1]}.{name}]", arrays) for name, d in data.items()}
+    if named and are_named(data):  # of objects
+        return {name: decode(d, named[0], place_of(name, d, where), arrays) for name, d in data.items()}
     number = isinstance(data, (int, float)) and not isinstance(data, bool) and (float, 0) in forms_of(expected)
     if any(is_class(a, eqx.Module) for a in options) and not number:
-        table: Any = {"kind": data} if isinstance(data, str) else data
-        opened = any(is_abstract(a) for a in options)  # to classes that are registered
-        _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
-        choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
-        # where no kind is given, the one class that is named by itself beside base classes, or the package's only one
-        plain = [a.__name__ for a in options if is_class(a, eqx.Module) and not is_abstract(a)]
-        evident = plain if len(plain) == 1 else [c.__name__ for c in fitting if is_own(c)]
-        _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
-        _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
-        kind = table.get("kind", *evident) if len(evident) == 1 else table["kind"]
-        if not (isinstance(kind, str) and kind in classes):
-            more = " A class of your own is known when the module is imported that calls mpm.register."
-            named = f"{_named(where, 'unknown kind')} {_short(kind)}{_close(_short(kind), classes)}"
-            raise ValueError(f"{named} It must be {choice}.{more * opened}")
-        keywords = arguments(classes[kind], {k: v for k, v in table.items() if k != "kind"}, where, arrays)
+        opened = is_open(options)
+        require_in(where, classes or opened, "takes an object of Python, which files cannot hold: leave it out")
+        kind, table = kind_in(data, classes, evident_kinds(options), where, opened=opened)
+        keywords = arguments(classes[kind], table, where, arrays)
         try:
             return classes[kind](**keywords)
         except ValueError as error:
             raise ValueError(f"{where}: {error}" if where else str(error)) from None
     if enums := [a for a in options if is_class(a, enum.Enum)]:
         words = [member.value for member in enums[0]]
-        _require(data in words, where, f"must be one of {', '.join(map(repr, words))}, got {_short(data)}")
+        require_in(where, data in words, f"must be one of {', '.join(map(repr, words))}, got {short(data)}")
         return enums[0](data)
     return _numbers(data, expected, where, arrays)
 
@@ -263,15 +268,15 @@ def _network(data: dict[str, Any], options: list[Any], where: str, arrays: dict[
             return data
         if "array" not in data:
             return decode(data, Callable, where, arrays)
-        _require(data["array"] in (arrays or {}), where, f"has lost its array {data['array']!r}")
+        require_in(where, data["array"] in (arrays or {}), f"has lost its array {data['array']!r}")
         return (arrays or {})[data["array"]]
 
     kind: Any = getattr(eqx.nn, data["kind"].removeprefix("equinox.nn."), None)
     fits = isinstance(kind, type) and any(is_class(a, eqx.Module) and issubclass(kind, a) for a in options)
-    _require(fits, where, f"cannot be the kind {_short(data['kind'])}")
+    require_in(where, fits, f"cannot be the kind {short(data['kind'])}")
     parts = _usual_functions(kind) | {name: part(value) for name, value in data.items() if name != "kind"}
     same = {f.name for f in fields(kind)} == parts.keys()
-    _require(same, where, f"has other fields than a {kind.__name__} of this version of equinox")
+    require_in(where, same, f"has other fields than a {kind.__name__} of this version of equinox")
     network = object.__new__(kind)
     for name, value in parts.items():
         object.__setattr__(network, name, value)
@@ -289,26 +294,11 @@ def arguments(
     function: Callable, table: Any, where: str, arrays: dict[str, np.ndarray] | None = None, without: Iterable[str] = ()
 ) -> dict[str, Any]:
     """The keyword arguments of a function or class that a table describes (see `decode`), some left out."""
-    _require(isinstance(table, dict), where, f"must be a table, got {_short(table)}")
+    require_in(where, isinstance(table, dict), f"must be a table, got {short(table)}")
     parameters = {name: p for name, p in parameters_of(function).items() if name not in without}
-    require_keys(table, parameters, where)
-    for name, (_, default) in parameters.items():
-        _require(name in table or default is not inspect.Parameter.empty, where, f"needs the key {name!r}")
-
-    def inside(key: str, value: Any) -> str:  # a table has a header, anything else is named after that which it is in
-        tables = value if isinstance(value, list) and value else [value]
-        if not all(isinstance(v, dict) and set(v) != {"array"} for v in tables):
-            return f"{where} {key}".strip()
-        return f"{where[:-1]}.{key}]" if where.endswith("]") else f"{where} [{key}]".strip()
-
-    return {key: decode(value, parameters[key][0], inside(key, value), arrays) for key, value in table.items()}
-
-
-def require_keys(table: dict[str, Any], names: Iterable[str], where: str) -> None:
-    """Check that a table in a file has no other keys than these."""
-    for key in (key for key in table if key not in names):
-        named = f"{_named(where, 'unknown key')} {_short(key)}{_close(key[:60], names)}"
-        raise ValueError(f"{named} Known here: {', '.join(names) or 'none'}.")
+    needed = [name for name, (_, default) in parameters.items() if default is inspect.Parameter.empty]
+    require_keys(table, parameters, where, needed)
+    return {k: decode(v, parameters[k][0], place_of(k, v, where), arrays) for k, v in table.items()}
 
 
 def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray] | None) -> Any:
@@ -316,21 +306,21 @@ def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray]
     forms, words = forms_of(expected), words_of(expected)
     must_be = f"must be {_in_words(forms, words)}, got"
     if isinstance(data, dict) and set(data) == {"array"} and arrays is not None:
-        _require(data["array"] in arrays, where, f"refers to the array {data['array']!r}, which is not there")
+        require_in(where, data["array"] in arrays, f"refers to the array {data['array']!r}, which is not there")
         a = arrays[data["array"]]
-        _require((float, a.ndim) in forms, where, f"{must_be} an array of shape {a.shape}")
+        require_in(where, (float, a.ndim) in forms, f"{must_be} an array of shape {a.shape}")
         kinds = {float}
     else:
         a = np.array(data, dtype=object)  # where lists are ragged, an array of lists
         kinds = {kind for kind, depth in forms if depth == a.ndim and all(_fits(leaf, kind) for leaf in a.flat)}
-        _require(kinds - {str} if words and data not in words else kinds, where, f"{must_be} {_short(data)}")
+        require_in(where, kinds - {str} if words and data not in words else kinds, f"{must_be} {short(data)}")
     if float in kinds:
         try:
             a = a if a.dtype.kind == "f" else a.astype(float)
             bad = np.isnan(a) if MAY_BE_INFINITE in marks_of(expected) else ~np.isfinite(a)
         except OverflowError:  # a whole number that no float holds
             bad = np.True_
-        _require(not bad.any(), where, f"must be finite, got {_short(data)}")
+        require_in(where, not bad.any(), f"must be finite, got {short(data)}")
     takes_tuples = any(tuple in (option, get_origin(option)) for option in alternatives(expected))
     if a.ndim and not (isinstance(data, list) and takes_tuples and a.size <= _SMALL):
         return a if float in kinds else np.array(data)
@@ -397,21 +387,3 @@ def _fits(leaf: Any, kind: type) -> bool:
     if isinstance(leaf, bool) or kind in (bool, str):
         return type(leaf) is kind
     return isinstance(leaf, (int, float)) if kind is float else isinstance(leaf, int) and abs(leaf) < 2**63
-
-
-def _close(word: str, words: Iterable[str]) -> str:
-    close = difflib.get_close_matches(word, words, 1)
-    return f", did you mean {close[0]!r}?" if close else "."
-
-
-def _named(where: str, what: str) -> str:
-    return f"{where}: {what}" if where else what.capitalize()
-
-
-def _short(data: Any) -> str:
-    return shortened(repr(data[:61] if isinstance(data, str) else data), 60)
-
-
-def _require(condition: Any, where: str, message: str) -> None:
-    if not condition:
-        raise ValueError(f"{where or 'The file'} {message}.")

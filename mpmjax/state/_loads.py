@@ -15,6 +15,7 @@ from mpmjax.geometry import (
     AbstractMotion,
     Changing,
     ChangingVector,
+    Motion,
     TimeSeries,
     inertia,
     require_some,
@@ -209,7 +210,7 @@ class Spring(AbstractLoad):
     on: AbstractPlace
     stiffness: Scalar | Point = 0.0
     damping: Scalar | Point | None = None
-    motion: AbstractMotion | None = None
+    motion: Motion | AbstractMotion | None = None
 
     def __check_init__(self):
         require_fields(self)
