@@ -511,17 +511,16 @@ def test_a_fluid_thrown_faster_than_its_sound_does_not_pass_the_floor(law, d, ma
 def test_what_a_plate_presses_follows_it_within_a_step(method, dt):
     """At a constant speed between walls: the force is that of the column and the springs, one behind the other."""
     speed, height = 0.002, 0.2
-    grid, body = block(cells=2)
-    way = mpm.Motion((0.0, 10.0), ((0.0, 0.0), (0.0, -10 * speed)))
-    plate = mpm.SeparatingCollider(mpm.HalfSpace((0.0, height), (0.0, -1.0)), way, 0.3)
-    sides = mpm.SymmetryPlane(0, 0.0), mpm.SymmetryPlane(0, 0.2, keep="below")
-    scene = mpm.Scene(grid, LAW, boundary=(mpm.SymmetryPlane(1, 0.0), *sides, plate))
+    grid, body = block(1, cells=2)
+    way = mpm.Motion((0.0, 10.0), ((0.0,), (-10 * speed,)))
+    plate = mpm.SeparatingCollider(mpm.HalfSpace((height,), (-1.0,)), way, 0.3)
+    scene = mpm.Scene(grid, LAW, boundary=(mpm.SymmetryPlane(0, 0.0), plate))
     run = mpm.simulate(scene, body, t1=6.0, dt=dt, method=METHODS[method], save_every=1)
     times, force, _ = run.forces()
     softer = 1 + grid.spacing / (20 * height)
     stretch = 1 - 5 * speed / (softer * height)
-    stress = -float(LAW.stress(jnp.diag(jnp.array([1.0, stretch]))[..., None])[1, 1, 0])
-    assert_close(np.interp(5.0, times, force[:, 0, 1]), 0.2 * stress, 0.01)
+    stress = -float(LAW.stress(jnp.full((1, 1, 1), stretch))[0, 0, 0])
+    assert_close(np.interp(5.0, times, force[:, 0, 0]), stress, 0.01)
 
 
 @pytest.mark.thorough
