@@ -74,13 +74,14 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
                 "sets fill the same place there is twice the mass. Leave one of them out there."
             )
             break
-    for number, group in enumerate(particles.groups, 1):
+    has_knots = grid.dim > 1 and scene.kernel.order == 2 and isinstance(scene.gradient, MLSGradient)
+    for number, (law, group) in enumerate(zip(scene.laws, particles.groups, strict=True), 1):
         rows = slice(*np.searchsorted(there, (group.rows.start, group.rows.stop)))
         which = "The body" if particles.counts is None else f"The body of material {number}"
         if rows.start < rows.stop:
             _warn_of_thinness(which, boundary, grid, x[rows], volume[rows, None] ** (1 / grid.dim) / 2)
-    if scene.kernel.order == 2 and isinstance(scene.gradient, MLSGradient):
-        _warn_of_knots(scene, particles)
+            if has_knots and not law.measure.axes and law.viscosity is None:
+                _warn_of_knots(x[rows] / np.asarray(grid.spacing))
     if not (total and scene.kernel.order == 1):
         _warn_of_contrast(scene, particles, there)
     warn_of_rounding(grid, particles.x)
@@ -120,19 +121,16 @@ def _warn_of_thinness(
             )
 
 
-def _warn_of_knots(scene: Scene, particles: Particles) -> None:
-    """Warn of a fluid on a lattice on which sums of moving least squares leave a force of a uniform pressure (see
-    docs/notes/figures.md, "Water at rest")."""
-    for law, group in zip(scene.laws, particles.groups, strict=True):
-        halves = 2 * np.asarray(particles.x, float)[group.rows] / float(scene.grid.spacing)
-        off = np.sort(np.abs(halves - np.rint(halves)) / 2, axis=1)[:, :2]
-        inviscid = not law.measure.axes and law.viscosity is None
-        if inviscid and off.shape[1] == 2 and (off.sum(axis=1) < _NEAR_KNOTS).sum() > 0.6 * len(off) > 0:
-            warn(
-                "Particles of a fluid stand near nodes and the middles between them, where its pressure stirs it "
-                "at rest, within seconds: give the scene gradient=SplineGradient(), or fill with three or four "
-                "particles along a cell."
-            )
+def _warn_of_knots(places: np.ndarray) -> None:
+    """Warn of an inviscid fluid at places [spacings] at which sums of moving least squares leave a force of a uniform
+    pressure (see docs/notes/figures.md, "Water at rest")."""
+    off = np.sort(np.abs(2 * places - np.rint(2 * places)) / 2, axis=1)[:, :2].sum(axis=1)
+    if (off < _NEAR_KNOTS).mean() > 0.6:
+        warn(
+            "Particles of a fluid stand near nodes and the middles between them, where its pressure stirs it at rest, "
+            "within seconds: give the scene gradient=SplineGradient(), or fill with three or four particles along a "
+            "cell."
+        )
 
 
 def _warn_of_contrast(scene: Scene, particles: Particles, there: np.ndarray) -> None:
