@@ -17,7 +17,7 @@ from mpmjax.checks._values import canonical
 from mpmjax.implicit import Projection, no_solve
 from mpmjax.potential import Mirror
 from mpmjax.stepping import NodeMotion, start_nodes, update
-from mpmjax.stepping._grid_update import SWEEPS, find_active_set
+from mpmjax.stepping._grid_update import SWEEPS
 
 TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(solver=TIGHT)}
@@ -134,7 +134,7 @@ def test_what_a_guess_holds_and_the_wall_would_have_to_pull_is_released(method):
     bar = eqx.tree_at(lambda b: b.F, mpm.prepare(mpm.Scene(grid, LAW), bar), 0.97 * jnp.ones((bar.count, 1, 1)))
     scene = mpm.Scene(grid, LAW, boundary=mpm.ContactPlane(0, 0.0))
     after, info = mpm.step(scene, bar, 0.0, 20 * explicit_limit(scene), method=method)
-    assert int(info.contact.sweeps) > 1
+    assert int(info.contact.sweeps) > 0
     assert int(info.contact.violations) == 0
     assert_close(after.v.mean(), np.asarray(1.0), 1e-10)
 
@@ -354,7 +354,8 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
     def try_out(x, v, field):
         start = mpm.prepare(scene, eqx.tree_at(lambda b: (b.x, b.v), body, (x, v)))
         nodes = start_nodes(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start))
-        active, _, _, sweeps = find_active_set(nodes, method)
+        new = update(nodes, method)
+        active, sweeps = new.constrained.active, new.contact.sweeps
         held_on_plane = active[0].reshape(-1)  # at the first plane's node along its axis, the fourth
         held = constrain(nodes, active)
         loose = (held.nodes.free[:, 0].reshape(grid.shape)[4] & held_on_plane).any()
@@ -370,7 +371,7 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
         partly += all(0 < held.sum() < 6 for held in columns)
         np.testing.assert_array_equal(once, twice)
         assert not loose
-        assert sweeps == 1 or number == 2
+        assert sweeps == 0 or number == 2
     assert partly > 10
 
 
@@ -442,7 +443,7 @@ class Stubborn(mpm.Explicit):
 
 
 @pytest.mark.thorough
-def test_an_active_set_that_does_not_settle_is_given_up_after_four_sweeps():
+def test_an_active_set_that_does_not_settle_is_given_up_after_five_sweeps():
     """And what is still wrong is reported."""
     nodes = in_touch(FLOORS["mirrored"](0.0))
     pulled = eqx.tree_at(lambda n: n.v, nodes, jnp.ones_like(nodes.velocity))

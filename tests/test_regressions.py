@@ -46,8 +46,8 @@ def test_newton_keeps_a_good_guess_where_the_grip_alone_would_invert():
 
 
 @pytest.mark.thorough
-def test_contact_starts_from_the_chosen_guess_and_counts_its_sweeps():
-    """Guesses differ in their iterations, and every sweep's are in the report."""
+def test_contact_starts_from_the_chosen_guess():
+    """Guesses differ in their iterations."""
     wall = mpm.SeparatingBox((-1.0,), (1.0,))
     scene, particles = bar(boundary=wall, gravity=(-50.0,))
     shaken = jnp.asarray(np.random.default_rng(0).normal(size=particles.v.shape))
@@ -57,7 +57,6 @@ def test_contact_starts_from_the_chosen_guess_and_counts_its_sweeps():
             guess=guess, preconditioner=mpm.implicit.MassPreconditioner()
         )  # which tells guesses apart in so small a bar
         _, info = mpm.step(scene, particles, 0.0, 0.05, method=method)
-        assert int(info.contact.sweeps) >= 1
         iterations.append(int(info.solve.iterations))
     assert len(set(iterations)) > 1
     assert min(iterations) > 0

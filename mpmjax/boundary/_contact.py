@@ -5,12 +5,11 @@ along a contact plane, of a contact of your own. Its gap g and normal impulse r 
 g is the velocity with which the gap opens, for faces and bodies the gap with its spring's length. The *active set* is
 the mask of the places that are held shut, one for each contact.
 
-It is guessed as the places that the start of the step, or the explicit velocity v*, closes. Then, at most `SWEEPS`
-times: solve with the active set held; release the places that would have to pull, hold those that are entered; stop
-when nothing changes. The conditions that are violated after that are counted in `ContactInfo.violations`. The last
-solve, with the set settled and started from the last sweep's result, is the one that is differentiated: its derivative
-is that of the active set, and does not exist where the set changes. An explicit step's force is known at its start, and
-with it which gaps are shut: it needs no sweep.
+It is guessed as the places that the start of the step, or the explicit velocity v*, closes. Then in sweeps: solve with
+the active set held; release the places that would have to pull, hold those that are entered; stop when nothing changes,
+or `SWEEPS` sets were given up. The conditions that are violated by then are counted in `ContactInfo.violations`. The
+derivative is that of a solve with the last set held, and does not exist where the set changes. An explicit step's force
+is known at its start, and with it which gaps are shut: it needs no sweep.
 
 Friction is an impulse at the places held, applied after the solve against the slip and at most μ times the normal
 impulse (Coulomb). It is not part of the implicit system, so it lags by the elastic response of one step (between bodies
@@ -48,7 +47,7 @@ ActiveSet = tuple[Bool[Array, "..."], ...]  # the places that are held, one mask
 class ContactInfo(eqx.Module):
     """The report of contact: how the active set was found."""
 
-    sweeps: Int[Array, "*f"]  # solves before the last one
+    sweeps: Int[Array, "*f"]  # solves beyond one, for active sets that were given up
     violations: Int[Array, "*f"]  # places that pull or are entered all the same
 
 
@@ -273,10 +272,10 @@ class ConstrainedNodes(eqx.Module):
     def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, tuple[NodeVector, ...]]:
         """The velocity after Coulomb friction, and the change of velocity by each contact [m/s].
 
-        Boundaries and pairs of bodies act one after the other: of at most three in every order, of more in the scene's
-        and the reverse, each from the same start. Each contact has the mean of its changes, so that none comes first.
-        The mean is within the limit and takes energy, as each is and does. The residual is without the impulses of
-        springs.
+        Boundaries and pairs of bodies act one after the other: of no more than there are directions in every order, of
+        more in the scene's and the reverse, each from the same start. Each contact has the mean of its changes, so that
+        none comes first. The mean is within the limit and takes energy, as each is and does. The residual is without
+        the impulses of springs.
         """
         tied, nodes, contacts = Mirror(self.nodes.tied), self.nodes, self.unconstrained.contacts
         rubbing = self if nodes.loose is None else replace(self, nodes=nodes.loose)
@@ -286,7 +285,7 @@ class ConstrainedNodes(eqx.Module):
         numbers = [-1 - k if number is None else number for k, number in enumerate(nodes.brought_by)]
         forth = [(k, friction) for k, friction in enumerate(frictions) if friction is not None]
         groups = [list(group) for _, group in groupby(forth, key=lambda pair: numbers[pair[0]])]
-        orders, by_order = list(permutations(groups)) if len(groups) <= 3 else [groups, groups[::-1]], []
+        orders, by_order = list(permutations(groups)) if len(groups) <= v.shape[1] else [groups, groups[::-1]], []
         for order in orders:
             rubbed, by_contact = v, [jnp.zeros_like(v)] * len(contacts)
             for k, friction in (pair for group in order for pair in group):

@@ -1,13 +1,15 @@
 """The result of a grid update, the update with contact, and the impulses of walls and grips."""
 
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Int, NodeVector, Scalar
-from mpmjax.autodiff import saved_for_backward, without_derivative
+from mpmjax.autodiff import custom_derivative, saved_for_backward, without_derivative
 from mpmjax.boundary import ActiveSet, ConstrainedNodes, ContactInfo, constrain, count_places
 from mpmjax.implicit import SolveInfo
 from mpmjax.potential import Mirror
@@ -15,7 +17,7 @@ from mpmjax.stepping._implicit_integrators import AbstractImplicitIntegrator
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
 
-SWEEPS = 4  # most active sets that are tried in a step
+SWEEPS = 4  # most active sets that are given up in a step
 
 
 class GridUpdate(eqx.Module):
@@ -83,54 +85,78 @@ class StageContact(eqx.Module):
 
 
 def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
-    """The grid update with contact: the active set is searched without derivatives, the last solve with it held is
+    """The grid update with contact: the active set is searched without derivatives, the solve with it held is
     differentiated, and friction acts after that."""
-    # the search is iterations: reverse mode stores their result and never differentiates them
-    active, guess, cost, sweeps = saved_for_backward(find_active_set(*without_derivative((nodes, method))))
-    held, new, holding = _solve_held(constrain(nodes, active), method, guess)
-    velocity, friction = held.friction(new.solved.velocity, holding)
-    contact = ContactInfo(sweeps, count_places(nodes, *held.violations(new.solved.velocity, holding)))
-    motion = method.with_friction(new.motion, velocity - new.motion.velocity)
-    return replace(new, motion=motion, solve=cost.followed_by(new.solve), friction=friction, contact=contact)
-
-
-def find_active_set(
-    nodes: Nodes, method: AbstractIntegrator
-) -> tuple[ActiveSet, NodeVector, SolveInfo, Int[Array, ""]]:
-    """The active set of contact, a velocity to start the last solve from, the report of the solves for it, and their
-    number. No contact may hold anything of the nodes yet. Not to be differentiated: loops have no derivative."""
-
-    def sweep(state: tuple) -> tuple:
-        active, guess, cost, _, count = state
-        held, new, holding = _solve_held(constrain(nodes, active), method, guess)
-        pulls, enters = held.violations(new.motion.velocity, holding)
-        # all places are exchanged at once (a primal-dual active set), so that the sweeps do not grow with their number
-        active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
-        changes = count_places(nodes, pulls, enters) > 0
-        return active, new.motion.carrier, cost.followed_by(new.solve), changes, count + 1
-
-    guess, zero, none = method.initial_guess(nodes), jnp.zeros((), nodes.mass.dtype), jnp.asarray(0, jnp.int32)
+    guess, violations = method.initial_guess(nodes), None
     start = method.mean_displacement(nodes, NodeMotion(guess))
     # what nothing holds moves with v*: the gaps that this closes are the first guess
     predictor, nothing_held = nodes.explicit_velocity(), ConstrainedNodes(nodes, (), Mirror(()), nodes, start)
     active = tuple(contact.likely_held(nothing_held, predictor) for contact in nodes.contacts)
-    cost = SolveInfo(residual=zero, report=zero)
     # the force of an explicit step is known at its start, and with it which gaps are shut
     if all(contact.known_at_start(nodes, method.is_explicit) for contact in nodes.contacts):
-        return active, guess, cost, none
-    first = (active, guess, cost, jnp.asarray(True), none)
-    active, guess, cost, _, count = jax.lax.while_loop(lambda s: s[3] & (s[4] < SWEEPS), sweep, first)
-    return active, guess, cost, count
+        held, sweeps = constrain(nodes, active), jnp.asarray(0, jnp.int32)
+        motion, info = _advance(held, method, guess)
+    else:
+        # the search is iterations: reverse mode stores their result and never differentiates them
+        search = saved_for_backward(find_active_set(*without_derivative((nodes, method, active, guess))))
+        active, motion, info, sweeps, violations = search
+        held = constrain(nodes, active)
+        motion, info = _as_advanced((motion, info), held, method)
+    held, new, holding = _held_update(held, method, motion, info)
+    if violations is None:
+        violations = count_places(nodes, *held.violations(new.solved.velocity, holding))
+    velocity, friction = held.friction(new.solved.velocity, holding)
+    motion = method.with_friction(motion, velocity - motion.velocity)
+    return replace(new, motion=motion, friction=friction, contact=ContactInfo(sweeps, violations))
 
 
-def _solve_held(
-    held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
+def find_active_set(
+    nodes: Nodes, method: AbstractIntegrator, active: ActiveSet, guess: NodeVector
+) -> tuple[ActiveSet, NodeMotion, SolveInfo, Int[Array, ""], Int[Array, ""]]:
+    """The active set of contact, the motion with it held, the report of the solves, the number of sets that were given
+    up, and of places where it is violated; from a first set and velocity [m/s]. No contact may hold anything of the
+    nodes yet. Not to be differentiated: loops have no derivative."""
+
+    def sweep(state: tuple) -> tuple:
+        active, _, motion, cost, count, _ = state
+        held = constrain(nodes, active)
+        motion, info = _advance(held, method, motion.carrier)
+        held, new, holding = _held_update(held, method, motion, info)
+        pulls, enters = held.violations(new.solved.velocity, holding)
+        # all places are exchanged at once (a primal-dual active set), so that the sweeps do not grow with their number
+        following = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
+        return following, active, motion, cost.followed_by(info), count + 1, count_places(nodes, pulls, enters)
+
+    motion, _ = eqx.filter_eval_shape(lambda: _advance(constrain(nodes, active), method, guess))
+    motion = jax.tree.map(lambda _: guess, motion)  # all fields of nodes: the first solve starts from the carrier
+    cost = SolveInfo(residual=jnp.zeros((), guess.dtype), report=jnp.zeros((), guess.dtype))
+    first = active, active, motion, cost, jnp.asarray(-1, jnp.int32), jnp.asarray(1, jnp.int32)
+    return jax.lax.while_loop(lambda s: (s[4] < SWEEPS) & (s[5] > 0), sweep, first)[1:]
+
+
+def _advance(held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+    """The motion of all nodes before friction at the end, and the report of the solve."""
+    motion, info = method.advance(replace(held.nodes, inner=StageContact(held)), guess)
+    return jax.tree.map(held.images.unfold, motion), info
+
+
+_as_advanced = custom_derivative(lambda solution, held, method: solution)
+"""A solution as it is, with the derivative of `_advance`, which is then solved once more, from there."""
+
+
+@_as_advanced.defjvp
+def _(primals: Any, tangents: Any) -> Any:
+    guess = primals[0][0].carrier
+    _, change = eqx.filter_jvp(partial(_advance, guess=guess), primals[1:], tangents[1:])
+    return _as_advanced(*primals), change
+
+
+def _held_update(
+    held: ConstrainedNodes, method: AbstractIntegrator, motion: NodeMotion, info: SolveInfo
 ) -> tuple[ConstrainedNodes, GridUpdate, NodeVector]:
     """The nodes with their displacement, their update before friction at the end, and the impulse that holds components
     of velocity [kg m/s], shape (n, d)."""
-    nodes = held.unconstrained
-    motion, info = method.advance(replace(held.nodes, inner=StageContact(held)), guess)
-    motion = solved = jax.tree.map(held.images.unfold, motion)
+    nodes, solved = held.unconstrained, motion
     if motion.friction is not None:
         # the equations of the nodes, which say what walls hold, know nothing of an inner stage's friction
         solved = replace(motion, velocity=motion.velocity - motion.friction)

@@ -150,8 +150,7 @@ def test_a_contact_plane_that_is_pressed_upon_is_a_symmetry_plane(kernel, method
         a, b = (np.asarray(getattr(run.frames, name)) for run in (symmetry, contact))
         assert_close(a, b, 1e-11)
     assert int(contact.statistics.violations) == 0
-    searched = 0 if method.is_explicit else int(contact.statistics.steps)  # an explicit step knows what is held
-    assert int(contact.statistics.sweeps) == searched
+    assert int(contact.statistics.sweeps) == 0  # the first set is right
 
 
 SPEED, LENGTH = 0.05, 1.0
