@@ -144,6 +144,8 @@ def test_who_asks_or_errs_does_not_wait_for_jax(tmp_path):
         "run scene.toml -o a.h5 --import none.py": "there is no file none.py",
         "check none.toml": "Cannot read the scene file none.toml",
         "fit scene.toml": "has no [fit] table",
+        "fit scene.toml --set grid.spacng=1": "[grid]: unknown key 'spacng', did you mean 'spacing'?",
+        "fit scene.toml --set fit.levl=0.9": "[fit]: unknown key 'levl', did you mean 'level'?",
         "fit scene.toml --resume": "name it by --log",
         "render none.h5 -o a.png": "none.h5 does not exist",
         "info none.h5": "none.h5 does not exist",
@@ -729,6 +731,13 @@ def test_the_examples_can_be_run(path):
 
 def test_fit_needs_a_fit_table(folder):
     assert "[fit]" in refused("fit", folder / "scene.toml")
+
+
+def test_a_change_is_made_for_a_fit(folder):
+    """Of keys of [fit] and of all others."""
+    words = "fit", folder / "scene.toml", "--set", "fit.observation=[]", "--set", "fit.t1=0.2"
+    assert "must not lie after that of [run], got 0.2 and 0.06" in refused(*words)
+    assert "must not lie after that of [run], got 0.2 and 0.1" in refused(*words, "--set", "run.t1=0.1")
 
 
 def test_a_stable_step_is_taken_and_told(tmp_path):
