@@ -256,6 +256,7 @@ def fit(
         list[str] | None,
         typer.Option("--profile", metavar="NAME", help="A fitted number whose profile is drawn; repeatable."),
     ] = None,
+    changes: Changes = None,
     most_seconds: MostSeconds = None,
     imports: Imports = None,
 ) -> None:
@@ -264,7 +265,7 @@ def fit(
     What to fit says the file's [fit] table. It prints a table, and writes a picture and its numbers as JSON. Ctrl-C
     ends it after the iteration in progress, with the best so far."""
     _require(log is not None or not resume, "--resume continues the fit of a log: name it by --log.")
-    table = scene_table(scene, fit=True, more=bool(imports))
+    table = scene_table(scene, changes or (), fit=True, more=bool(imports))
     _require("fit" in table, f"{scene} has no [fit] table: there is nothing to fit.")
     plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
     _require_folder(plot)
@@ -273,7 +274,8 @@ def fit(
     except ValueError:
         raise ValueError(f"--refine must be whole numbers with commas, such as 2, got {str(refine)[:20]!r}.") from None
     with _package(imports) as cli:
-        cli.fit_scene(scene, plot, grids, profiles or (), log=log, resume=resume, most_seconds=most_seconds)
+        options = {"log": log, "resume": resume, "most_seconds": most_seconds}
+        cli.fit_scene(scene, changes or (), plot, grids, profiles or (), **options)
 
 
 @_command

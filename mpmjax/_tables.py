@@ -1,24 +1,29 @@
-"""Tables in files: their keys and kinds, and the words for what is wrong with these.
+"""Tables in files: their keys, kinds and bounds, and the words for what is wrong with these.
 
-No room is imported here, which takes a second: a scene file's keys and kinds are checked by `scene.schema.json`, the
-schema of the package's own classes. `mpmjax schema --import mpmjax > mpmjax/scene.schema.json` writes it anew.
+No room is imported here, which takes a second: a scene file is checked by `scene.schema.json`, made of the package's
+own classes and their marks. `mpmjax schema --import mpmjax > mpmjax/scene.schema.json` writes it anew.
 """
 
 import difflib
 import json
+import math
 import tomllib
 from collections.abc import Collection, Iterable, Sequence
+from functools import reduce
+from operator import and_, ge, gt, le, lt, or_
 from pathlib import Path
 from typing import Any, TypeGuard
 
 SCHEMA = Path(__file__).with_name("scene.schema.json")
 OPEN = "A class of your own may stand here."  # which the schema says of a place
+_HOLDS = {"minimum": ge, "maximum": le, "exclusiveMinimum": gt, "exclusiveMaximum": lt}
 
 
 def scene_table(path: Path, changes: Sequence[str] = (), *, fit: bool = False, more: bool = False) -> dict[str, Any]:
     """The table in a scene file, after changes "KEY=VALUE" with a dotted key and a value as TOML writes it (a string
-    may lack its quotes). A ValueError says in one line what is not one of these, or what key or kind is unknown or
-    missing, also in `[fit]` with `fit`. Where there may be `more` kinds than the package's own it leaves them."""
+    may lack its quotes). A ValueError says in one line what is not one of these, what key or kind is unknown or
+    missing, what number is out of bounds, also in `[fit]` with `fit`. Where there may be `more` kinds than the
+    package's own it leaves them."""
     try:
         table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -70,8 +75,10 @@ def _check_keys(table: dict[str, Any], schema: dict[str, Any], where: str, kinds
 
 
 def _check_tables(value: Any, schema: dict[str, Any], where: str, kinds: dict[str, Any], more: bool) -> None:
-    """Check the tables in a value by its schema. All else is left to who reads the value."""
-    options = schema.get("anyOf", [schema])
+    """Check the tables in a value by its schema, and its numbers by their bounds. All else is left to who reads it."""
+    options, bounds = schema.get("anyOf", [schema]), _bounds(schema)
+    inside = not bounds or all(within(number, bounds) for number in _numbers(value))
+    require_in(where, inside, f"{schema.get('description')}, got {short(value)}")
     objects = {option["$ref"].removeprefix("#/$defs/"): option for option in options if "$ref" in option}
     if isinstance(value, list):
         items = next((o["items"] for o in options if {"anyOf", "properties"} & o.get("items", {}).keys()), {})
@@ -92,6 +99,24 @@ def _check_tables(value: Any, schema: dict[str, Any], where: str, kinds: dict[st
         whole = [table for table in alike if set(table["required"]) <= value.keys()]
         for table in (whole or alike)[:1]:
             _check_keys(_without_kind(value), table, where, kinds, more)
+
+
+def _bounds(schema: dict[str, Any]) -> dict[str, float | int]:
+    """The bounds of the numbers that a schema takes, in lists however nested."""
+    inner = [*schema.get("anyOf", ()), *([schema["items"]] if "items" in schema else ())]
+    return reduce(or_, map(_bounds, inner), {name: schema[name] for name in _HOLDS if name in schema})
+
+
+def _numbers(value: Any) -> list[float | int]:
+    """The finite numbers in a value, in lists however nested."""
+    if isinstance(value, list):
+        return [number for item in value for number in _numbers(item)]
+    return [value] if type(value) in (int, float) and abs(value) < math.inf else []
+
+
+def within(numbers: Any, bounds: dict[str, float | int]) -> Any:
+    """Whether a number, or each of an array, lies within bounds, named as JSON schemas do."""
+    return reduce(and_, (_HOLDS[name](numbers, bound) for name, bound in bounds.items()))
 
 
 def _without_kind(table: dict[str, Any]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import pytest
 from helpers import ELASTIC, FLUIDS, METHODS, PLASTIC, RUBBER, SECOND_ORDER, VISCOUS, block, ids
 
 import mpmjax as mpm
+from mpmjax._tables import within
 from mpmjax.checks import between, checked, finite, positive, require_fields, whole
 from mpmjax.checks._values import canonical, first_unmet, requirements
 from mpmjax.material._fluid import Tait
@@ -242,6 +243,22 @@ def test_annotations_say_what_must_hold_of_values(make, values, says):
     make(share=None)
     with pytest.raises(ValueError, match=f"^{re.escape(says)}$"):
         make(**values)
+
+
+@pytest.mark.parametrize(
+    "mark",
+    [positive, between(0, 1), between(-1, 1, open_ends=True), between(4, np.inf), whole(2)],
+    ids=str,
+)
+def test_the_bounds_of_a_mark_are_what_it_checks(mark):
+    """By those a scene file is refused before the class is imported."""
+    for value in (-2, -1, 0, 1, 2, 3, 4, 10**9):
+        try:
+            mark("It", value)
+        except ValueError:
+            assert not within(value, mark.bounds)
+        else:
+            assert within(value, mark.bounds)
 
 
 @pytest.mark.parametrize(("args", "values"), [((2.0,), {}), ((), {"shear": 2.0})])

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from operator import ge, gt, le, lt
 from pathlib import Path
 
 import equinox as eqx
@@ -137,6 +138,15 @@ def test_who_asks_or_errs_does_not_wait_for_jax(tmp_path):
         "run scene.toml -o a.h5 --set material={kind='NeoHookean'}": "[material] needs the key 'youngs_modulus'",
         "run scene.toml -o a.h5 --set boundary.0.kind=Slip": "[[boundary]] 1: unknown kind 'Slip', did you mean 'SlipB",
         "run scene.toml --vary run.tt=1:2:3": "[run]: unknown key 'tt'",
+        "run scene.toml -o a.h5 --dt 0": "[run] dt [s] must be greater than zero, got 0.",
+        "run scene.toml -o a.h5 --set particles.0.particles_per_cell=0": "particles_per_cell must be at least 1",
+        "run scene.toml -o a.h5 --set run.save_every=0": "save_every must be a whole number of at least 1, got 0.",
+        "run scene.toml --vary material.poisson_ratio=0.5:0.4:2": "must be strictly between -1 and 0.5, got 0.5.",
+        "check scene.toml --set material.youngs_modulus=[1e5,0.0]": "[material] youngs_modulus [Pa] must be greater th",
+        "check scene.toml --set run.method.beta=-1": "[run.method] beta must be from 0 to 1, got -1.",
+        "check scene.toml --set particles.0.density=0": "[[particles]] 1 density [kg/m^d] must be greater than zero",
+        "check scene.toml --set grid.shape=[9,3]": "[grid] shape must be at least 4, got [9, 3].",
+        "fit scene.toml --set fit.level=1": "[fit] level must be strictly between 0 and 1, got 1.",
         "check scene.toml --set particles.0.region.kind=Bocks": "[[particles]] 1 [region]: unknown kind 'Bocks'",
         "check fit.toml": "[[fit.parameter]] 1: unknown key 'pth'",
         "fit fit.toml": "[[fit.parameter]] 1: unknown key 'pth', did you mean 'path'?",
@@ -144,6 +154,8 @@ def test_who_asks_or_errs_does_not_wait_for_jax(tmp_path):
         "run scene.toml -o a.h5 --import none.py": "there is no file none.py",
         "check none.toml": "Cannot read the scene file none.toml",
         "fit scene.toml": "has no [fit] table",
+        "fit scene.toml --set grid.spacng=1": "[grid]: unknown key 'spacng', did you mean 'spacing'?",
+        "fit scene.toml --set fit.levl=0.9": "[fit]: unknown key 'levl', did you mean 'level'?",
         "fit scene.toml --resume": "name it by --log",
         "render none.h5 -o a.png": "none.h5 does not exist",
         "info none.h5": "none.h5 does not exist",
@@ -311,7 +323,9 @@ def valid(value, schema, defs):
         return all(valid(v, schema["additionalProperties"], defs) for v in value.values())
     if isinstance(value, list) and "items" in schema:
         return all(valid(v, schema["items"], defs) for v in value)
-    fits = value == schema.get("const", value) and value in schema.get("enum", [value])
+    ends = {"minimum": ge, "maximum": le, "exclusiveMinimum": gt, "exclusiveMaximum": lt}
+    inside = all(holds(value, schema[end]) for end, holds in ends.items() if end in schema)
+    fits = inside and value == schema.get("const", value) and value in schema.get("enum", [value])
     return fits and ("anyOf" not in schema or any(valid(value, each, defs) for each in schema["anyOf"]))
 
 
@@ -333,6 +347,8 @@ def test_the_schema_holds_the_examples_and_no_slip(monkeypatch):
         {"gravitty": [0.0, 1.0]},
         {"grid": {"shape": [8, 8]}},
         {"material": {"kind": "NeoHookean", "youngs_modulus": "soft", "poisson_ratio": 0.3}},
+        {"material": {"kind": "NeoHookean", "youngs_modulus": [1e5, 0.0], "poisson_ratio": 0.3}},
+        {"material": {"kind": "NeoHookean", "youngs_modulus": 1e5, "poisson_ratio": 0.5}},
         {"boundary": [{"kind": "SlipBox", "lower": [0.0], "upper": [1.0], "friction": 0.1}]},
         {"run": {"dt": 0.1}},
         {"material": {"gel": {"kind": "NeoHookean", "youngs_modulus": 1e5}}},
@@ -550,7 +566,7 @@ BAD_SCENES = {
     "no time for pilot runs": ("dt = 1e-2", 'dt = "auto"\nmost_seconds = 0', r"\[run\] most_seconds"),
     "unknown field": ('"stress"', '"strain"', r"\[output\] fields must be some of .*, got 'strain'"),
     "no step": ("dt = 1e-2", "", r"\[run\] needs the key 'dt'"),
-    "a step in words": ("dt = 1e-2", 'dt = "small"', r'"stable" or "auto", got \'small\''),
+    "a step in words": ("dt = 1e-2", 'dt = "small"', r"\[run\] dt must be a number or 'stable' or 'auto', got 'small'"),
     "counts": ("density = 1e3", "density = 1e3\nparticles_per_cell = 3", r"\[\[particles\]\] 1.*2-th power"),
 }
 
@@ -677,7 +693,7 @@ BAD_MATERIALS = {
         "poison_ratio = 0.3",
         r"\[\[material\]\] 2: .*'poisson_ratio'",
     ),
-    "number of the first law": (TWO, "yield_stress = 1e2", "yield_stress = -1", r"\[\[material\]\] 1: .*yield_stress"),
+    "number of the first law": (TWO, "yield_stress = 1e2", "yield_stress = -1", r"\[\[material\]\] 1 yield_stress"),
     "key of a later table": (TWO, "density = 500.0", "denstiy = 500.0", r"\[\[particles\]\] 3: .*'density'"),
 }
 
@@ -729,6 +745,13 @@ def test_the_examples_can_be_run(path):
 
 def test_fit_needs_a_fit_table(folder):
     assert "[fit]" in refused("fit", folder / "scene.toml")
+
+
+def test_a_change_is_made_for_a_fit(folder):
+    """Of keys of [fit] and of all others."""
+    words = "fit", folder / "scene.toml", "--set", "fit.observation=[]", "--set", "fit.t1=0.2"
+    assert "must not lie after that of [run], got 0.2 and 0.06" in refused(*words)
+    assert "must not lie after that of [run], got 0.2 and 0.1" in refused(*words, "--set", "run.t1=0.1")
 
 
 def test_a_stable_step_is_taken_and_told(tmp_path):

@@ -327,7 +327,7 @@ def test_tolerance_is_relative_to_the_right_hand_side(dtype):
         ({"rtol": 0.0}, "rtol must be greater than zero"),
         ({"rtol": np.nan}, "rtol must be finite"),
         ({"increment_rtol": -1.0}, "increment_rtol must be greater than zero"),
-        ({"max_steps": 0}, "max_steps must be at least 1"),
+        ({"max_steps": 0}, "max_steps must be a whole number of at least 1"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, message):

@@ -40,13 +40,13 @@ def test_one_bool_makes_every_direction_periodic():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"shape": (8, 3)}, "one, two or three integers of at least 4, got"),
+        ({"shape": (8, 3)}, "shape must be at least 4, got"),
         ({"shape": ()}, "one, two or three integers"),
         ({"shape": (8, 8, 8, 8)}, "one, two or three integers"),
-        ({"spacing": 0.0}, "spacing must be greater than zero"),
-        ({"spacing": -0.5}, "spacing must be greater than zero"),
-        ({"spacing": np.nan}, "spacing must be finite"),
-        ({"spacing": np.inf}, "spacing must be finite"),
+        ({"spacing": 0.0}, r"spacing \[m\] must be greater than zero"),
+        ({"spacing": -0.5}, r"spacing \[m\] must be greater than zero"),
+        ({"spacing": np.nan}, r"spacing \[m\] must be finite"),
+        ({"spacing": np.inf}, r"spacing \[m\] must be finite"),
         ({"origin": (0,)}, "origin must have 2 entries"),
         ({"periodic": (True,)}, "periodic must have 2 entries"),
         ({"periodic": (True, False), "follow": True}, "periodic grid cannot follow"),

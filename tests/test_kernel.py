@@ -233,7 +233,7 @@ def test_following_window_keeps_the_material_in_its_middle(d):
 @pytest.mark.parametrize("order", [0, 4, -1])
 def test_other_orders_are_refused(order):
     """Only orders 1, 2 and 3 exist."""
-    with pytest.raises(ValueError, match="order must be 1, 2 or 3"):
+    with pytest.raises(ValueError, match="order must be from 1 to 3"):
         mpm.BSpline(order)
 
 

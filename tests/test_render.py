@@ -194,6 +194,18 @@ def test_squares_are_as_large_as_their_particles(stretch):
     assert covered == pytest.approx(12 * 0.3 * stretch * scale**2, rel=0.02)
 
 
+def test_squares_turn_and_shear_with_their_particles():
+    """A corner is where F takes it, as that of a parallelogram."""
+    run = still_run(np.ones((1, 1, 2)), volume=0.36)
+    figure, draw = _flat_canvas(run, None, "")
+    c, s = np.cos(0.5), np.sin(0.5)
+    F = np.array([[c, -s], [s, c]]) @ [[1.0, 0.4], [0.0, 1.0]]
+    draw(dataclasses.replace(run.final, deformations=(jnp.asarray(F)[None],)), np.full(1, np.nan), 0.0)
+    (path,) = figure.axes[0].collections[0].get_paths()
+    corners = 1 + 0.3 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ F.T
+    np.testing.assert_allclose(path.vertices[:4], corners, atol=1e-6)
+
+
 @pytest.mark.parametrize("d", [1, 2, 3])
 @pytest.mark.parametrize("colour", ["speed", "none"])
 def test_one_particle_is_drawn(tmp_path, d, colour):

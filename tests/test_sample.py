@@ -284,10 +284,10 @@ class Nowhere(mpm.geometry.AbstractRegion):
     ("arguments", "message"),
     [
         ({"particles_per_cell": 3}, "2-th power of a whole number"),
-        ({"particles_per_cell": 0}, "2-th power of a whole number"),
-        ({"particles_per_cell": -4}, "2-th power of a whole number"),
+        ({"particles_per_cell": 0}, "particles_per_cell must be at least 1, got 0"),
+        ({"particles_per_cell": -4}, "particles_per_cell must be at least 1, got -4"),
         ({"particles_per_cell": (2, 2, 2)}, "one or 2 positive whole numbers"),
-        ({"particles_per_cell": (2, 0)}, "one or 2 positive whole numbers"),
+        ({"particles_per_cell": (2, 0)}, r"particles_per_cell must be at least 1, got \(2, 0\)"),
         ({"density": 0.0}, "density .* must be greater than zero"),
         ({"density": -1.0}, "density .* must be greater than zero"),
         ({"density": np.nan}, "density .* must be finite"),

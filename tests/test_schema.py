@@ -402,7 +402,7 @@ ERRORS = [
     ({"grid__shape": [True, 8]}, "[grid] shape must be a list of whole numbers, got [True, 8]."),
     ({"grid__spacing": [0.1]}, "[grid] spacing must be a number, got [0.1]."),
     ({"grid__spacing": 10**400}, "[grid] spacing must be finite, got 1000"),
-    ({"grid__spacing": -1}, "[grid]: A grid's spacing must be greater than zero, got -1.0."),
+    ({"grid__spacing": -1}, "[grid]: Grid's spacing [m] must be greater than zero, got -1.0."),
     ({"grid__follow": 1}, "[grid] follow must be true or false, got 1."),
     ({"grid__kind": "Gird"}, "[grid]: unknown kind 'Gird', did you mean 'Grid'? It must be Grid."),
     ({"material__kind": None}, "[material] needs a kind: one of Active, CamClay, DruckerPrager, FixedCorotated, "),
@@ -481,7 +481,7 @@ ERRORS = [
         "[[material]] 2: unknown kind 'Snoww', did you mean 'Snow'? It must be one of Active, CamClay, DruckerPrager,",
     ),
     ({"transfer": "PICK"}, "transfer: unknown kind 'PICK', did you mean 'PIC'? It must be one of APIC, FLIP, PIC."),
-    ({"kernel": {"order": 4}}, "[kernel]: A B-spline's order must be 1, 2 or 3, got 4."),
+    ({"kernel": {"order": 4}}, "[kernel]: BSpline's order must be from 1 to 3, got 4."),
 ]
 
 

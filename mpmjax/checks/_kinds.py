@@ -70,7 +70,7 @@ def checked(function: Function) -> Function:
 def require_fields(module: eqx.Module) -> None:
     """Check that every field of a module is of the kind that its annotation names, can fix a program if it is static,
     and has the values that marks ask for. They are functions of a name and a value that raise `ValueError`s, and a unit
-    for the name: `Annotated[PerParticle, positive, "Pa"]`. None has no values."""
+    for the name: `Annotated[PerParticle, positive, "Pa"]`. None and words have no values."""
     for name, hint, static, marks in _hints(type(module)):
         value, what = getattr(module, name), f"{type(module).__name__}'s {name}"
         require_kind(what, value, hint)
@@ -95,9 +95,9 @@ def require_kind(name: str, value: Any, hint: Any) -> None:
 
 
 def require_marks(name: str, value: Any, marks: list[Any]) -> None:
-    """Call the functions among an annotation's marks on a value that is not None, its name with the unit among them."""
+    """Call the functions among an annotation's marks on a value but None and words, its name with the unit of these."""
     name += "".join(f" [{unit}]" for unit in marks if isinstance(unit, str))
-    for check in (mark for mark in marks if callable(mark) and value is not None):
+    for check in (mark for mark in marks if callable(mark) and not isinstance(value, (str, NoneType))):
         check(name, value)
 
 

@@ -11,7 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ import lineax as lx
 import numpy as np
 
 from mpmjax._jax import Tracer
-from mpmjax._tables import shortened
+from mpmjax._tables import shortened, within
 
 _UNKNOWN = 2**34  # memory assumed to be available if the system does not say [B]
 
@@ -194,6 +194,7 @@ class Mark:
 
     words: str  # what must hold
     check: Callable[[str, Any], object]  # raises a ValueError for a name and a value that does not meet it
+    bounds: dict[str, float | int] = field(default_factory=dict, compare=False)  # of numbers, named as in JSON schemas
 
     def __call__(self, name: str, value: Any) -> None:
         self.check(name, value)
@@ -202,27 +203,27 @@ class Mark:
         return self.words
 
 
-finite, positive = Mark("finite", require_finite), Mark("positive", require_positive)
-tolerance = Mark("a relative tolerance", require_tolerance)
+finite, positive = Mark("finite", require_finite), Mark("greater than zero", require_positive, {"exclusiveMinimum": 0})
+tolerance = Mark("a relative tolerance greater than zero", require_tolerance, {"exclusiveMinimum": 0})
 
 
 def between(lower: float | int, upper: float | int, *, open_ends: bool = False) -> Mark:
     """The mark of numbers in [lower, upper], or in (lower, upper) with `open_ends`."""
-    words = f"strictly between {lower} and {upper}" if open_ends else f"from {lower} to {upper}"
-
-    def inside(a: Any) -> Any:
-        return (a > lower) & (a < upper) if open_ends else (a >= lower) & (a <= upper)
+    words = f"from {lower} to {upper}" if upper < math.inf else f"at least {lower}"
+    words = f"strictly between {lower} and {upper}" if open_ends else words
+    names = ("exclusiveMinimum", "exclusiveMaximum") if open_ends else ("minimum", "maximum")
+    bounds = {name: end for name, end in zip(names, (lower, upper), strict=True) if abs(end) < math.inf}
 
     def check(name: str, value: Any) -> None:
         require_finite(name, value)
-        require_that(f"{name} must be {words}", inside, value)
+        require_that(f"{name} must be {words}", lambda a: within(a, bounds), value)
 
-    return Mark(words, check)
+    return Mark(words, check, bounds)
 
 
 def whole(least: int) -> Mark:
     """The mark of numbers that `require_whole` takes."""
-    return Mark(f"at least {least}", partial(require_whole, least=least))
+    return Mark(f"a whole number of at least {least}", partial(require_whole, least=least), {"minimum": least})
 
 
 def canonical(tree: Any, dtype: Any) -> Any:

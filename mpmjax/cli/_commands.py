@@ -193,6 +193,7 @@ def _summary(start: Particles, run: Run, taken: int = 0, seconds: float = 0.0) -
 
 def fit_scene(
     scene: Path,
+    changes: Sequence[str],
     plot: Path,
     grids: tuple[int, ...] | None,
     profiles: Sequence[str],
@@ -201,9 +202,10 @@ def fit_scene(
     resume: bool,
     most_seconds: float | None,
 ) -> None:
-    """Fit what a scene file's [fit] table names: on its grids, or those asked for, with profiles of some of it."""
+    """Fit what a scene file's [fit] table names, after changes to that file: on its grids, or those asked for, with
+    profiles of some of it."""
     begun = time.perf_counter()
-    asked = read_fit(scene, lambda file: _chosen(file, most_seconds))
+    asked = read_fit(scene, lambda file: _chosen(file, most_seconds, changes if file == scene else ()))
     grids = asked.refine if grids is None else refinements(grids, "--refine")
     if grids:
         asked.refined(grids[-1])  # a grid that cannot be is refused before the first fit

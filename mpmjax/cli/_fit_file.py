@@ -12,7 +12,7 @@ import numpy as np
 
 from mpmjax._tables import require_keys, shortened
 from mpmjax._types import Scalar
-from mpmjax.checks import between, require, require_positive
+from mpmjax.checks import between, require, require_positive, whole
 from mpmjax.cli._measurements import observation
 from mpmjax.cli._scene_file import Simulation, marked_arguments, read_simulation
 from mpmjax.fitting import (
@@ -102,7 +102,7 @@ _KEYS = ("t1", *_SETTINGS, *_TABLES)
 def fit_settings(
     *,
     level: Annotated[Scalar, between(0, 1, open_ends=True)] = 0.95,
-    starts: int | Literal["auto"] = "auto",
+    starts: Annotated[int, whole(1)] | Literal["auto"] = "auto",
     fraction: Annotated[Scalar, between(0, 1)] | None = None,
     horizons: tuple[float, ...] | bool = False,
     refine: int | tuple[int, ...] = (),
@@ -111,7 +111,6 @@ def fit_settings(
 ) -> dict[str, Any]:
     """How to fit, of a [fit] table."""
     many = starts != "auto" and starts > 1
-    require(starts == "auto" or starts > 0, f"[fit] starts must be one at least, got {starts}.")
     require(many or fraction is None, "[fit] fraction is one of starts: give these too.")
     fraction = 0.375 if fraction is None else fraction
     require(not (many and horizons), "[fit] takes either starts or horizons.")

@@ -22,7 +22,6 @@ from mpmjax.checks import (
     positive,
     require,
     require_marks,
-    require_positive,
     shortened,
     warn,
     whole,
@@ -40,7 +39,7 @@ class RunSettings(eqx.Module):
     """The `[run]` table of a scene file."""
 
     t1: Annotated[float, positive, "s"] = eqx.field(converter=float)  # end time
-    dt: Scalar | str | None = None  # step [s], or "stable"; None for "auto"
+    dt: Annotated[Scalar, positive, "s"] | Literal["stable", "auto"] | None = None  # step; None for "auto"
     method: AbstractIntegrator | None = None  # None for "auto"
     save_every: Annotated[int, whole(1)] | None = None  # steps from frame to frame; None if the file does not say
     precision: Literal["float32", "float64"] | None = None  # None for JAX's own, in the shell float64
@@ -48,10 +47,6 @@ class RunSettings(eqx.Module):
     most_seconds: Annotated[float, positive] = eqx.field(converter=float, default=60.0)  # that its pilot runs may take
 
     def __check_init__(self):
-        if isinstance(self.dt, str):
-            require(self.dt == "stable", f'[run] dt must be a step in seconds, "stable" or "auto", got {self.dt!r}.')
-        elif self.dt is not None:
-            require_positive("[run] dt", self.dt)
         double = jnp.result_type(float) == jnp.float64 or self.precision != "float64"
         require(double, '[run] precision = "float64" needs jax.config.update("jax_enable_x64", True) first.')
 

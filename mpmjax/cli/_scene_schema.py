@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, get_args, get_origin
 
 from mpmjax._tables import OPEN
-from mpmjax.checks import alternatives, is_class
+from mpmjax.checks import Mark, alternatives, is_class, marks_of
 from mpmjax.cli._fit_file import fit_parameter, fit_settings
 from mpmjax.cli._measurements import KINDS, keys_of
 from mpmjax.cli._scene_file import RunSettings, particles_in
@@ -28,7 +28,7 @@ def scene_schema() -> dict[str, Any]:
     run = _table(RunSettings)
     run["properties"]["method"]["anyOf"].append({"const": "auto"})
     fit, text = _table(fit_settings), {"type": "string"}
-    fit["properties"] = {"t1": {"type": "number"}} | fit["properties"]
+    fit["properties"] = {"t1": run["properties"]["t1"]} | fit["properties"]
     fit["properties"] |= {
         "report": {"type": "object", "additionalProperties": text},
         "parameter": tables(_table(fit_parameter, without=("experiments",))),
@@ -63,12 +63,13 @@ def _table(function: Callable, without: Iterable[str] = (), kind: str | None = N
 def _value(hint: Any) -> dict[str, Any]:
     """The JSON schema of what an annotation takes."""
     json, options = {float: "number", int: "integer", bool: "boolean", str: "string"}, alternatives(hint)
-    words = words_of(hint)
+    words, marks = words_of(hint), [mark for mark in marks_of(hint) if isinstance(mark, Mark) and mark.bounds]
+    bounds = {name: bound for mark in marks for name, bound in mark.bounds.items()}
     choices: list[dict[str, Any]] = [{"enum": words}] if words else []
     for kind, depth in sorted(forms_of(hint), key=str):
         if words and (kind, depth) == (str, 0):
             continue
-        value: dict[str, Any] = {"type": json[kind]}
+        value: dict[str, Any] = {"type": json[kind]} | (bounds if kind in (float, int) else {})
         for _ in range(depth):
             value = {"type": "array", "items": value}
         choices.append(value)
@@ -87,4 +88,7 @@ def _value(hint: Any) -> dict[str, Any]:
         elif get_origin(a) in (tuple, list) and (item := _value(get_args(a)[0])) and not forms_of(a):
             choices += [{"type": "array", "items": item}, item]
     unique = [choice for i, choice in enumerate(choices) if choice not in choices[:i]]
-    return ({"anyOf": unique} if unique else {}) | ({"$comment": OPEN} if kinds and is_open(options) else {})
+    units = [f"[{mark}]" for mark in marks_of(hint) if isinstance(mark, str)]
+    text = " ".join([*units, *(f"must be {mark.words}" for mark in marks)])
+    schema = ({"anyOf": unique} if unique else {}) | ({"description": text} if text else {})
+    return schema | ({"$comment": OPEN} if kinds and is_open(options) else {})

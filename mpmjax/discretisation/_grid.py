@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Int, NodeVector, ParticleVector, Scalar
-from mpmjax.checks import checked, require, require_positive, require_whole
+from mpmjax.checks import between, checked, positive, require, require_fields, whole
 
 _MOST_NODES = 2**31  # what an index of 32 bits counts
+_Spacing = Annotated[Scalar, positive, "m"]
 
 
 class Grid(eqx.Module):
@@ -42,8 +43,8 @@ class Grid(eqx.Module):
             two dimensions or with a period along r.
     """
 
-    shape: tuple[int, ...] = eqx.field(static=True, converter=tuple)
-    spacing: Scalar
+    shape: Annotated[tuple[int, ...], between(4, math.inf)] = eqx.field(static=True, converter=tuple)
+    spacing: _Spacing
     origin: tuple[int, ...] = eqx.field(static=True)
     periodic: tuple[bool, ...] = eqx.field(static=True)
     follow: bool = eqx.field(static=True)
@@ -54,12 +55,12 @@ class Grid(eqx.Module):
     def __init__(
         self,
         shape: tuple[int, ...] | list[int],
-        spacing: Scalar,
+        spacing: _Spacing,
         *,
         origin: tuple[int, ...] | list[int] | None = None,
         periodic: bool | tuple[bool, ...] | list[bool] = False,
         follow: bool = False,
-        layers: int = 1,
+        layers: Annotated[int, whole(1)] = 1,
         axisymmetric: bool = False,
     ):
         self.shape = tuple(int(n) for n in shape)
@@ -68,16 +69,13 @@ class Grid(eqx.Module):
         every = (periodic,) * len(self.shape) if isinstance(periodic, bool) else periodic
         self.periodic = tuple(bool(p) for p in every)
         self.follow = follow
-        self.layers = require_whole("layers", layers, 1)
+        self.layers = int(layers)
         self.axisymmetric = axisymmetric
 
     def __check_init__(self):
+        require_fields(self)
         d = len(self.shape)
-        require(
-            d in (1, 2, 3) and all(n >= 4 for n in self.shape),
-            f"A grid's shape must be one, two or three integers of at least 4, got {self.shape}.",
-        )
-        require_positive("A grid's spacing", self.spacing)
+        require(d in (1, 2, 3), f"A grid's shape must be one, two or three integers, got {self.shape}.")
         require(
             self.size < _MOST_NODES,
             f"A grid's window must have fewer than 2^31 nodes, got {self.size} by the shape {self.shape}: take a "

@@ -1,13 +1,14 @@
 """B-spline kernels, and the gradient operators that are made of them."""
 
 from abc import abstractmethod
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import require, require_fields
+from mpmjax.checks import between, require_fields
 
 VARIANCE = {2: 1 / 4, 3: 1 / 3}  # `BSpline.variance` of each order
 _STEEPEST = {2: 6.0, 3: 3.1368191}
@@ -31,11 +32,8 @@ class BSpline(eqx.Module):
         order: 1, 2 or 3.
     """
 
-    order: int = eqx.field(static=True, default=2)
-
-    def __check_init__(self):
-        require_fields(self)
-        require(self.order in (1, 2, 3), f"A B-spline's order must be 1, 2 or 3, got {self.order}.")
+    order: Annotated[int, between(1, 3)] = eqx.field(static=True, default=2)
+    __check_init__ = require_fields
 
     @property
     def variance(self) -> float:

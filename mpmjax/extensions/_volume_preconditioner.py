@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial, reduce
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Int, NodeVector
-from mpmjax.checks import as_plain, require, require_fields
+from mpmjax.checks import as_plain, require, require_fields, whole
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.extensions._dissection import DissectedFactor, Dissection, dissected_factor
 from mpmjax.implicit import (
@@ -58,12 +58,11 @@ class VolumePreconditioner(AbstractPreconditioner):
             they are. What reaches beyond it is not preconditioned, so that iterations grow. Default: the whole window.
     """
 
-    largest: int = eqx.field(static=True, default=60_000_000)
+    largest: Annotated[int, whole(0)] = eqx.field(static=True, default=60_000_000)
     extent: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     def __check_init__(self):
         require_fields(self)
-        require(self.largest >= 0, f"VolumePreconditioner's largest must not be negative, got {self.largest}.")
         require(
             self.extent is None or (len(self.extent) > 0 and all(length >= 1 for length in self.extent)),
             f"VolumePreconditioner's extent must be a number of nodes from 1 for each axis, got {self.extent}.",

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
-from mpmjax.checks import require, require_fields, tolerance
+from mpmjax.checks import require_fields, tolerance, whole
 from mpmjax.implicit._solve_info import SolveInfo, require_solver
 from mpmjax.implicit._solver import DEFAULT_RTOL, NEARLY_CONVERGED, NEGLIGIBLE_CHANGE, ConjugateResidual, solve_linear
 from mpmjax.implicit._stage import AbstractStageSolver, StageProblem
@@ -55,11 +55,8 @@ class Newton(AbstractStageSolver):
 
     solver: Annotated[lx.AbstractLinearSolver, require_solver] = ConjugateResidual(rtol=1e-3)
     rtol: Annotated[Scalar, tolerance] | None = None
-    max_steps: int = eqx.field(static=True, default=30)
-
-    def __check_init__(self):
-        require_fields(self)
-        require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")
+    max_steps: Annotated[int, whole(1)] = eqx.field(static=True, default=30)
+    __check_init__ = require_fields
 
     def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         rtol = DEFAULT_RTOL[guess.dtype.itemsize] if self.rtol is None else self.rtol

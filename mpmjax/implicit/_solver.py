@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
 from mpmjax.autodiff import custom_derivative
-from mpmjax.checks import positive, require, require_fields, tolerance
+from mpmjax.checks import positive, require_fields, tolerance, whole
 from mpmjax.discretisation import Basis, basis_attributes, resist_sum, without_flat
 from mpmjax.implicit._operator import (
     AbstractInnerProduct,
@@ -71,11 +71,8 @@ class ConjugateResidual(AbstractInnerProductSolver):
 
     rtol: Annotated[Scalar, tolerance] | None = None
     increment_rtol: Annotated[Scalar, positive] | None = None
-    max_steps: int = eqx.field(static=True, default=1000)
-
-    def __check_init__(self):
-        require_fields(self)
-        require(self.max_steps >= 1, f"ConjugateResidual's max_steps must be at least 1, got {self.max_steps}.")
+    max_steps: Annotated[int, whole(1)] = eqx.field(static=True, default=1000)
+    __check_init__ = require_fields
 
     def init(self, operator: Any, options: dict[str, Any]) -> Any:
         if not isinstance(operator, ImplicitOperator) and not lx.is_symmetric(operator):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Point, Scalar
-from mpmjax.checks import checked, coordinates, is_traced, positive, require, require_memory, shortened
+from mpmjax.checks import between, checked, coordinates, is_traced, positive, require, require_memory, shortened
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractMotion, AbstractRegion, Box, box_cells, inside_parts
 from mpmjax.state._particles import Particles
@@ -26,7 +26,7 @@ def fill(
     region: AbstractRegion,
     grid: Grid,
     *,
-    particles_per_cell: int | tuple[int, ...] | list[int] | None = None,
+    particles_per_cell: Annotated[int | tuple[int, ...] | list[int], between(1, np.inf)] | None = None,
     density: Annotated[Scalar, positive, "kg/m^d"],
     velocity: Velocity | None = None,
     dtype: type | str | None = None,
@@ -63,9 +63,9 @@ def fill(
     if particles_per_cell is None:
         counts = np.full(d, 2)
     elif isinstance(particles_per_cell, (int, np.integer)):
-        root = round(max(0, particles_per_cell) ** (1 / d))
+        root = round(particles_per_cell ** (1 / d))
         require(
-            root >= 1 and root**d == particles_per_cell,
+            root**d == particles_per_cell,
             f"particles_per_cell must be the {d}-th power of a whole number (or a tuple of {d} counts), got "
             f"{particles_per_cell}.",
         )
