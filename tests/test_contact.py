@@ -17,7 +17,7 @@ from mpmjax.checks._values import canonical
 from mpmjax.implicit import Projection, no_solve
 from mpmjax.potential import Mirror
 from mpmjax.stepping import NodeMotion, start_nodes, update
-from mpmjax.stepping._grid_update import SWEEPS, find_active_set
+from mpmjax.stepping._grid_update import SWEEPS, StageContact, find_active_set
 
 TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(solver=TIGHT)}
@@ -429,6 +429,23 @@ def test_there_is_no_friction_where_a_wall_would_have_to_pull():
             slowed = held.friction(v, momentum_residual)[0][:, 0]
             assert slowed.max() == 1
             assert (slowed.min() == 1) == (up < 0)
+
+
+def test_friction_after_an_inner_stage_takes_nodes_that_follow_as_they_follow():
+    """Whatever a solve leaves at nodes that a plane moves, of velocity or displacement."""
+    fields = jnp.asarray(np.random.default_rng(0).normal(size=(2, 10 * 9, 2)))
+
+    @jax.jit
+    def rubbed(fields):
+        nodes = in_touch(FLOORS["mirrored"](0.3))
+        held = constrain(nodes, tuple(contact.shut for contact in nodes.contacts))
+        v, u = fields[0] - jnp.asarray([0.0, 9.0]), 1e-3 * fields[1]
+        both = (jnp.stack([field, held.images.unfold(field)]) for field in (v, u))
+        return jax.vmap(lambda v, u: StageContact(held).friction(OTHERS["trbdf2"], v, u, 0.6))(*both)
+
+    one, other = rubbed(fields)
+    assert np.abs(one).max() > 0.1
+    assert_close(one, other, 1e-12)
 
 
 class Stubborn(mpm.Explicit):
