@@ -374,13 +374,13 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
     assert partly > 10
 
 
-def in_touch(boundary, height=0.0):
-    """The nodes of a block on a boundary, or above it, of which nothing is held yet."""
+def in_touch(boundary, height=0.0, dt=1e-3):
+    """The nodes of a block on a boundary, or above it, of which nothing is held yet, at the start of a step."""
     grid = mpm.Grid((10, 9), DX, origin=(-4, -3))
     block = mpm.fill(mpm.Box((-0.1, 0.0), (0.3, 0.2)), grid, density=1e3)
     scene = canonical(mpm.Scene(grid, LAW, boundary=boundary), float)
     start = mpm.prepare(scene, eqx.tree_at(lambda b: b.x, block, block.x + jnp.asarray([0.0, height])))
-    return start_nodes(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start))
+    return start_nodes(scene, start, jnp.zeros(()), jnp.asarray(dt), scene.stencil(start))
 
 
 @pytest.mark.thorough
@@ -431,21 +431,34 @@ def test_there_is_no_friction_where_a_wall_would_have_to_pull():
             assert (slowed.min() == 1) == (up < 0)
 
 
-def test_friction_after_an_inner_stage_takes_nodes_that_follow_as_they_follow():
-    """Whatever a solve leaves at nodes that a plane moves, of velocity or displacement."""
-    fields = jnp.asarray(np.random.default_rng(0).normal(size=(2, 10 * 9, 2)))
+PLACES = {"plain": "near", "mirrored": "shut"}  # the places of contact that may be held
+
+
+@EACH_FLOOR
+def test_friction_after_a_stage_is_that_of_a_step_as_long(floor):
+    """TR-BDF2's first, by the mean of the forces at its ends, with nodes that a plane moves where they follow, whatever
+    its solution has there. Where the nodes would have to be pulled there is none."""
+    fields, share = jnp.asarray(np.random.default_rng(0).normal(size=(2, 10 * 9, 2))), 0.6
 
     @jax.jit
-    def rubbed(fields):
-        nodes = in_touch(FLOORS["mirrored"](0.3))
-        held = constrain(nodes, tuple(contact.shut for contact in nodes.contacts))
-        v, u = fields[0] - jnp.asarray([0.0, 9.0]), 1e-3 * fields[1]
-        both = (jnp.stack([field, held.images.unfold(field)]) for field in (v, u))
-        return jax.vmap(lambda v, u: StageContact(held).friction(OTHERS["trbdf2"], v, u, 0.6))(*both)
+    def rubbed(fields, rise, height):
+        nodes, short = (in_touch(FLOORS[floor](0.3), height, dt) for dt in (1e-3, share * 1e-3))
+        shut = [tuple(getattr(c, PLACES[floor]) for c in n.contacts) for n in (nodes, short)]
+        held, step = map(constrain, (nodes, short), shut)
+        v, u = jnp.stack([jnp.asarray(20.0), rise]) + 0.1 * fields[0], 1e-4 * fields[1]
+        change = StageContact(held).friction(OTHERS["trbdf2"], v, u, share)
+        v, u = map(held.images.unfold, (v, u))
+        _, resistance = jax.jvp(nodes.potential.force, (0 * u,), (u,))
+        inertia = nodes.mass[:, None] * (v - nodes.velocity - short.dt * nodes.acceleration)
+        missing = inertia - short.dt * (nodes.force + resistance / 2)
+        step = dataclasses.replace(step, displacement=u / 2)
+        wanted = step.friction(v, step.without_spring_impulses(missing))[0] - v
+        return change, jnp.where(held.nodes.occupied, wanted, 0)
 
-    one, other = rubbed(fields)
-    assert np.abs(one).max() > 0.1
-    assert_close(one, other, 1e-12)
+    change, wanted = rubbed(fields, -2.0, -0.02 * DX)
+    assert np.abs(wanted).max() > 1e-3
+    assert_close(change, wanted, 1e-9)
+    assert not np.any(rubbed(fields, 2.0, 0.02 * DX if floor == "plain" else -0.02 * DX))
 
 
 class Stubborn(mpm.Explicit):
