@@ -1,14 +1,18 @@
 """`ImplicitMidpoint` and `TRBDF2`: their steps, how they damp, what they conserve."""
 
+from dataclasses import replace
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, VISCOUS, assert_close, explicit_limit, ids, thorough
+from helpers import DESCRIPTIONS, VISCOUS, assert_close, block, explicit_limit, ids, thorough
 from numpy_oracle import grid_update
 from test_implicit import jolted
 
 import mpmjax as mpm
+from mpmjax._types import Array
 from mpmjax.implicit import ImplicitOperator, Projection
 from mpmjax.stepping import NodeMotion, reaction
 
@@ -199,6 +203,38 @@ def test_a_motion_counts_half_of_what_slows_it():
     slowed = mpm.ImplicitMidpoint().with_friction(NodeMotion(one, one), -one)
     assert (slowed.carrier == 0.5).all()
     assert (slowed.velocity == 0).all()
+    at_end = mpm.TRBDF2(0.3).with_friction(NodeMotion(one, one), -one)
+    np.testing.assert_allclose(at_end.carrier, 1 - mpm.TRBDF2(0.3).weights()[3], rtol=1e-14)
+
+
+class Kick(eqx.Module):
+    """Contacts in an inner stage that change all velocities at its end."""
+
+    by: Array
+
+    def change(self, share):
+        return None
+
+    def friction(self, method, v, u, share):
+        return self.by
+
+
+def test_what_rubs_in_an_inner_stage_is_told_beside_the_force():
+    """Velocity changes by gravity, by the elastic impulse and by the part of it that the step keeps."""
+    scene, particles = block(1, side=2, gravity=(-9.81,))
+    nodes = grid_update(scene, particles, 3 * explicit_limit(scene), mpm.Explicit()).nodes
+    method, kick = METHODS["trbdf2"], jnp.where(nodes.occupied, jnp.asarray([[0.3]]), 0)
+
+    @jax.jit
+    def missing(nodes, kick):
+        motion, _ = method.advance(replace(nodes, inner=Kick(kick)), nodes.velocity)
+        told = replace(motion, velocity=motion.velocity - motion.friction)
+        return motion.friction, reaction(nodes, told, method.elastic_impulse(nodes, motion)), nodes.mass * 0.3
+
+    kept, left, size = missing(nodes, kick)
+    _, _, q1, q2 = method.weights()
+    assert_close(kept, q1 / q2 * kick, 1e-13)
+    assert np.abs(left).max() < 1e-12 * size.max()
 
 
 FLOORS = {
