@@ -374,12 +374,19 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
     assert partly > 10
 
 
-def in_touch(boundary, height=0.0, dt=1e-3):
+BLOCK_GRID = mpm.Grid((10, 9), DX, origin=(-4, -3))
+
+
+def in_a_block():
+    return mpm.fill(mpm.Box((-0.1, 0.0), (0.3, 0.2)), BLOCK_GRID, density=1e3)
+
+
+def in_touch(boundary, height=0.0, dt=1e-3, rising=0.0):
     """The nodes of a block on a boundary, or above it, of which nothing is held yet, at the start of a step."""
-    grid = mpm.Grid((10, 9), DX, origin=(-4, -3))
-    block = mpm.fill(mpm.Box((-0.1, 0.0), (0.3, 0.2)), grid, density=1e3)
-    scene = canonical(mpm.Scene(grid, LAW, boundary=boundary), float)
-    start = mpm.prepare(scene, eqx.tree_at(lambda b: b.x, block, block.x + jnp.asarray([0.0, height])))
+    block = in_a_block()
+    scene = canonical(mpm.Scene(BLOCK_GRID, LAW, boundary=boundary), float)
+    x, v = block.x + jnp.asarray([0.0, height]), block.v.at[:, 1].set(rising)
+    start = mpm.prepare(scene, dataclasses.replace(block, x=x, v=v))
     return start_nodes(scene, start, jnp.zeros(()), jnp.asarray(dt), scene.stencil(start))
 
 
@@ -459,6 +466,50 @@ def test_friction_after_a_stage_is_that_of_a_step_as_long(floor):
     assert np.abs(wanted).max() > 1e-3
     assert_close(change, wanted, 1e-9)
     assert not np.any(rubbed(fields, 2.0, 0.02 * DX if floor == "plain" else -0.02 * DX))
+
+
+def test_a_collider_that_moves_rubs_on_what_does_not_move_with_it():
+    """And pushes no face that is more than a spacing before or behind its surface; one that comes nearer at w by
+    1 + ρ w²/(λ + 2μ) as stiffly."""
+    motion = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.4, 0.0)))
+    floor = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), motion, friction=0.3)
+
+    @jax.jit
+    def rubbed(speed, height, rising=0.0):
+        nodes = in_touch(floor, height, rising=rising)
+        held = constrain(nodes, tuple(contact.near for contact in nodes.contacts))
+        v = jnp.zeros_like(nodes.velocity).at[:, 0].set(speed)
+        (contact,) = nodes.contacts
+        return held.friction(v, 0 * v)[0][:, 0] - speed, contact.near[0], contact.stiffness[0]
+
+    (faster, _, stiffness), (same, *_) = rubbed(0.0, -0.02 * DX), rubbed(0.4, -0.02 * DX)
+    assert faster.max() > 1e-3
+    assert faster.min() == 0
+    assert np.abs(same).max() < 1e-14
+    gap = (np.asarray(in_a_block().x)[:, 1] - 0.25 * DX) - 1.3 * DX
+    np.testing.assert_array_equal(rubbed(0.0, -1.3 * DX)[1], np.abs(gap) < DX)
+    for rising, share in ((5.0, 1.0), (-5.0, 1 + 1e3 * 5.0**2 / (LAW.lame_lambda + 2 * LAW.shear_modulus))):
+        assert_close(rubbed(0.0, -0.02 * DX, rising)[2], share * stiffness, 1e-12)
+
+
+@pytest.mark.parametrize("ends", [(0.01 * DX, 9.0), (-9.0, 0.2 - 0.01 * DX)], ids=["below", "above"])
+def test_either_of_two_opposite_walls_rubs(ends):
+    """With μ times the push of its springs."""
+    (low, high), mu = ends, 0.3
+
+    @jax.jit
+    def slowed(low, high):
+        nodes = in_touch(mpm.SeparatingBox((-np.inf, low), (np.inf, high), friction=mu))
+        shut = tuple(contact.near & (contact.gap < 0) for contact in nodes.contacts)
+        held = constrain(nodes, shut)
+        v = jnp.zeros_like(nodes.velocity).at[:, 0].set(9.0)
+        push = sum(c.spring_impulse(held, each)[:, 1].sum() for c, each in zip(nodes.contacts, shut, strict=True))
+        return nodes.mass @ (held.friction(v, 0 * v)[0] - v), push
+
+    (lost, across), push = slowed(low, high)
+    assert abs(push) > 0
+    assert across == 0
+    assert_close(-lost, mu * abs(push), 1e-12)
 
 
 class Stubborn(mpm.Explicit):
