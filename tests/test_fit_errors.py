@@ -21,7 +21,7 @@ import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._result import Minimum, fit_result, minimum_of
 from mpmjax.fitting._search import Search, search, search_many
-from mpmjax.fitting._uncertainty import _mean_square, noise, seen_together, uncertainty
+from mpmjax.fitting._uncertainty import _mean_square, at_bound, banded, noise, seen_together, uncertainty
 from mpmjax.viz import write_fit
 
 fit = partial(mpm.fit, discretisation=False)  # most of these tests are of the search
@@ -629,3 +629,31 @@ def test_the_noise_is_that_beside_what_parameters_fit_that_no_bound_holds():
         ((_, factor, found),) = minimum_of(problem, search).noise
         assert found == pytest.approx(freedom)
         assert factor == pytest.approx(np.sqrt((held**2).sum() / freedom))
+
+
+def test_what_moves_a_minimum_and_each_observations_noise_add_up():
+    """Covariances by numbers: of two observations, the noise of one known from few residuals to be three times as
+    large in its square, and Σ Δ Δᵀ/4; the degrees of freedom of an error, and of a new measurement of the second."""
+    rng = np.random.default_rng(5)
+    J, moved, g, sigma = rng.normal(size=(30, 2)), 0.1 * rng.normal(size=(2, 2)), np.array([1.0, -2.0]), 0.2
+    rows = slice(0, 10), slice(10, 30)
+    both = uncertainty(J, 2e-16, [(rows[0], 3.0, 8.0), (rows[1], 1.0, 19.0)], moved)
+    whole = np.linalg.inv(J.T @ J)
+    parts = [c * whole @ J[k].T @ J[k] @ whole for c, k in zip((3, 1), rows, strict=True)] + [moved.T @ moved / 4]
+    assert np.allclose(both.inverse, sum(parts), rtol=1e-12)
+    variances = np.array([g @ part @ g for part in parts])
+    error, freedom = both.of(g)
+    assert error == pytest.approx(np.sqrt(variances.sum()))
+    assert freedom == pytest.approx(variances.sum() ** 2 / (variances[0] ** 2 / 8 + variances[1] ** 2 / 19))
+    new = variances + np.array([0, sigma**2, 0])
+    known = new.sum() ** 2 / (new[0] ** 2 / 8 + new[1] ** 2 / 19)
+    band = banded(both, 0.95, 1.0, g, np.asarray(sigma), 1)
+    assert band.new_upper == pytest.approx(1 + t.ppf(0.975, known) * np.sqrt(new.sum()))
+
+
+def test_a_number_lies_at_a_bound_within_a_hundredth_of_its_error():
+    r, J = np.array([1.0, 2.0, 0.5, 1.0]), np.ones((4, 1))
+    error = np.sqrt((r**2).sum() / 3) / 2
+    for share, held in ((0.9e-2, True), (1.1e-2, False)):
+        assert at_bound(r, J, np.array([[share * error], [1e9]])) == held
+    assert not at_bound(r, J, np.array([[1e9], [0.0]]))  # which the data do not want
