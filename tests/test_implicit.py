@@ -604,7 +604,7 @@ def differentiated(rests, q, dq, converges, nearly):
 COTANGENT = jnp.asarray([1.0, -2.0])
 
 
-@pytest.mark.parametrize("rests", [True, False])
+@pytest.mark.parametrize("rests", [True, *thorough(False)])
 def test_the_derivative_of_a_stage_is_that_of_its_solution_or_none(rests):
     """By force, normal and speed of what holds a node. A tangent solve that ends nearly at its tolerance is taken; of
     one that does not there is NaN and a report, none of those after it."""
