@@ -549,6 +549,14 @@ def test_in_the_total_description_a_sticky_collider_is_a_grip_that_turns():
     assert_close(after.x, [0.25, 0.1] + (np.asarray(block.x) - [0.1, 0.0]) @ R.T, 1e-13)
 
 
+def test_what_passes_a_collider_comes_from_outside_by_more_than_a_spacing():
+    """Beside what enters slowly, what was inside and what goes past."""
+    start = jnp.asarray([[-0.3, 0.5], [-0.05, 0.5], [0.1, 0.5], [-0.3, 0.5]])
+    end = jnp.asarray([[1.3, 0.5], [0.02, 0.5], [0.9, 0.5], [-0.3, 2.0]])
+    body = mpm.StickyCollider(mpm.Box((0.0, 0.0), (1.0, 1.0)))
+    assert body.passed(start, end, DX, 0.0, DT, 1.5).tolist() == [True, False, False, False]
+
+
 @pytest.mark.parametrize(
     ("boundary", "options", "message"),
     [

@@ -17,7 +17,7 @@ from mpmjax.checks._values import canonical
 from mpmjax.implicit import Projection, no_solve
 from mpmjax.potential import Mirror
 from mpmjax.stepping import NodeMotion, start_nodes, update
-from mpmjax.stepping._grid_update import SWEEPS
+from mpmjax.stepping._grid_update import SWEEPS, StageContact
 
 TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(solver=TIGHT)}
@@ -375,13 +375,20 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
     assert partly > 10
 
 
-def in_touch(boundary, height=0.0):
-    """The nodes of a block on a boundary, or above it, of which nothing is held yet."""
-    grid = mpm.Grid((10, 9), DX, origin=(-4, -3))
-    block = mpm.fill(mpm.Box((-0.1, 0.0), (0.3, 0.2)), grid, density=1e3)
-    scene = canonical(mpm.Scene(grid, LAW, boundary=boundary), float)
-    start = mpm.prepare(scene, eqx.tree_at(lambda b: b.x, block, block.x + jnp.asarray([0.0, height])))
-    return start_nodes(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start))
+BLOCK_GRID = mpm.Grid((10, 9), DX, origin=(-4, -3))
+
+
+def in_a_block():
+    return mpm.fill(mpm.Box((-0.1, 0.0), (0.3, 0.2)), BLOCK_GRID, density=1e3)
+
+
+def in_touch(boundary, height=0.0, dt=1e-3, rising=0.0):
+    """The nodes of a block on a boundary, or above it, of which nothing is held yet, at the start of a step."""
+    block = in_a_block()
+    scene = canonical(mpm.Scene(BLOCK_GRID, LAW, boundary=boundary), float)
+    x, v = block.x + jnp.asarray([0.0, height]), block.v.at[:, 1].set(rising)
+    start = mpm.prepare(scene, dataclasses.replace(block, x=x, v=v))
+    return start_nodes(scene, start, jnp.zeros(()), jnp.asarray(dt), scene.stencil(start))
 
 
 @pytest.mark.thorough
@@ -430,6 +437,80 @@ def test_there_is_no_friction_where_a_wall_would_have_to_pull():
             slowed = held.friction(v, momentum_residual)[0][:, 0]
             assert slowed.max() == 1
             assert (slowed.min() == 1) == (up < 0)
+
+
+PLACES = {"plain": "near", "mirrored": "shut"}  # the places of contact that may be held
+
+
+@EACH_FLOOR
+def test_friction_after_a_stage_is_that_of_a_step_as_long(floor):
+    """TR-BDF2's first, by the mean of the forces at its ends, with nodes that a plane moves where they follow, whatever
+    its solution has there. Where the nodes would have to be pulled there is none."""
+    fields, share = jnp.asarray(np.random.default_rng(0).normal(size=(2, 10 * 9, 2))), 0.6
+
+    @jax.jit
+    def rubbed(fields, rise, height):
+        nodes, short = (in_touch(FLOORS[floor](0.3), height, dt) for dt in (1e-3, share * 1e-3))
+        shut = [tuple(getattr(c, PLACES[floor]) for c in n.contacts) for n in (nodes, short)]
+        held, step = map(constrain, (nodes, short), shut)
+        v, u = jnp.stack([jnp.asarray(20.0), rise]) + 0.1 * fields[0], 1e-4 * fields[1]
+        change = StageContact(held).friction(OTHERS["trbdf2"], v, u, share)
+        v, u = map(held.images.unfold, (v, u))
+        _, resistance = jax.jvp(nodes.potential.force, (0 * u,), (u,))
+        inertia = nodes.mass[:, None] * (v - nodes.velocity - short.dt * nodes.acceleration)
+        missing = inertia - short.dt * (nodes.force + resistance / 2)
+        step = dataclasses.replace(step, displacement=u / 2)
+        wanted = step.friction(v, step.without_spring_impulses(missing))[0] - v
+        return change, jnp.where(held.nodes.occupied, wanted, 0)
+
+    change, wanted = rubbed(fields, -2.0, -0.02 * DX)
+    assert np.abs(wanted).max() > 1e-3
+    assert_close(change, wanted, 1e-9)
+    assert not np.any(rubbed(fields, 2.0, 0.02 * DX if floor == "plain" else -0.02 * DX))
+
+
+def test_a_collider_that_moves_rubs_on_what_does_not_move_with_it():
+    """And pushes no face that is more than a spacing before or behind its surface; one that comes nearer at w by
+    1 + ρ w²/(λ + 2μ) as stiffly."""
+    motion = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.4, 0.0)))
+    floor = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), motion, friction=0.3)
+
+    @jax.jit
+    def rubbed(speed, height, rising=0.0):
+        nodes = in_touch(floor, height, rising=rising)
+        held = constrain(nodes, tuple(contact.near for contact in nodes.contacts))
+        v = jnp.zeros_like(nodes.velocity).at[:, 0].set(speed)
+        (contact,) = nodes.contacts
+        return held.friction(v, 0 * v)[0][:, 0] - speed, contact.near[0], contact.stiffness[0]
+
+    (faster, _, stiffness), (same, *_) = rubbed(0.0, -0.02 * DX), rubbed(0.4, -0.02 * DX)
+    assert faster.max() > 1e-3
+    assert faster.min() == 0
+    assert np.abs(same).max() < 1e-14
+    gap = (np.asarray(in_a_block().x)[:, 1] - 0.25 * DX) - 1.3 * DX
+    np.testing.assert_array_equal(rubbed(0.0, -1.3 * DX)[1], np.abs(gap) < DX)
+    for rising, share in ((5.0, 1.0), (-5.0, 1 + 1e3 * 5.0**2 / (LAW.lame_lambda + 2 * LAW.shear_modulus))):
+        assert_close(rubbed(0.0, -0.02 * DX, rising)[2], share * stiffness, 1e-12)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-9.0, 0.2 - 0.01 * DX), *thorough((0.01 * DX, 9.0))])
+def test_either_of_two_opposite_walls_rubs(low, high):
+    """With μ times the push of its springs."""
+    mu = 0.3
+
+    @jax.jit
+    def slowed(low, high):
+        nodes = in_touch(mpm.SeparatingBox((-np.inf, low), (np.inf, high), friction=mu))
+        shut = tuple(contact.near & (contact.gap < 0) for contact in nodes.contacts)
+        held = constrain(nodes, shut)
+        v = jnp.zeros_like(nodes.velocity).at[:, 0].set(9.0)
+        push = sum(c.spring_impulse(held, each)[:, 1].sum() for c, each in zip(nodes.contacts, shut, strict=True))
+        return nodes.mass @ (held.friction(v, 0 * v)[0] - v), push
+
+    (lost, across), push = slowed(low, high)
+    assert abs(push) > 0
+    assert across == 0
+    assert_close(-lost, mu * abs(push), 1e-12)
 
 
 class Stubborn(mpm.Explicit):

@@ -4,6 +4,7 @@ import functools
 import json
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import diffrax
 import equinox as eqx
@@ -18,9 +19,9 @@ from scipy.stats import norm, t
 
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._result import Minimum, fit_result
+from mpmjax.fitting._result import Minimum, fit_result, minimum_of
 from mpmjax.fitting._search import Search, search, search_many
-from mpmjax.fitting._uncertainty import _mean_square, noise, seen_together, uncertainty
+from mpmjax.fitting._uncertainty import _mean_square, at_bound, banded, noise, seen_together, uncertainty
 from mpmjax.viz import write_fit
 
 fit = partial(mpm.fit, discretisation=False)  # most of these tests are of the search
@@ -154,6 +155,9 @@ def test_what_a_fit_says_follows_from_its_residuals(fall):
     moved = replace(result, experiments=(replace(e, observations=(drawn,)),), **parts)
     assert np.allclose(moved.fitted[0][0], value)
     assert np.allclose(moved.fitted[1][0], J[..., :1])
+    given = replace(result, noise=tuple(n._replace(estimated=False) for n in result.noise))
+    assert 0 < given.p_value < 1
+    assert np.isnan([p.p_value for p in (result, moved, replace(given, experiments=moved.experiments))]).all()
 
 
 @pytest.mark.thorough
@@ -362,7 +366,7 @@ def test_a_minimum_beyond_a_bound_is_found_at_it_with_a_one_sided_interval(name)
         norm.ppf(0.975),
         [(bound, np.inf), (-np.inf, np.inf)] if side > 0 else [(-np.inf, bound), (-np.inf, np.inf)],
     )
-    beyond = 0
+    beyond = beside = 0
     for data, result in zip(y, results, strict=True):
         free = side * (np.linalg.lstsq(LINE, data)[0][0] - bound) / ERROR
         wanted = lsq_linear(LINE, data, np.transpose(bounds)).x
@@ -374,11 +378,16 @@ def test_a_minimum_beyond_a_bound_is_found_at_it_with_a_one_sided_interval(name)
         assert result.degrees_of_freedom == STEPS - 2 + a.at_bound
         far = free + np.sqrt(min(free, 0) ** 2 + q**2)
         near = max(free - q, 0)
+        ends = np.sort(bound + side * ERROR * np.array([near, far]))
         if near == 0:
-            ends = np.sort(bound + side * ERROR * np.array([near, far]))
             assert np.allclose(a.interval, ends, rtol=0, atol=5e-3 * ERROR)
+        elif free < 3 * q:  # beside the bound, all of the line's and what the coordinate's has besides
+            assert a.interval[0] < ends[0] + 5e-3 * ERROR
+            assert ends[1] - 5e-3 * ERROR < a.interval[1]
         beyond += a.at_bound
+        beside += near > 0
     assert 0 < beyond < 24
+    assert beside > 0 or name != "lower"
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.5, 1.0, 2.3, 4.2])
@@ -599,3 +608,52 @@ def test_the_noise_of_an_observation_is_that_of_its_own_residuals():
         less = np.sqrt((r[rows] ** 2).sum() / (freedom - 3))
         assert noise(r, J, rows, count - 3, 1.0, None) == pytest.approx((less, freedom - 3))
     assert np.isnan(noise(r, J, slice(0, 25), 1, 1.0, None)[0])
+
+
+def test_the_noise_is_that_beside_what_parameters_fit_that_no_bound_holds():
+    """A line of two numbers, the first at its bound, which the data want beyond: one degree of freedom more."""
+    times, rng = np.arange(1.0, 41), np.random.default_rng(0)
+    seen = mpm.Series(times, 0 * times, mpm.fitting.CentreOfMass())
+    J = np.vander(times / 40, 2)
+    r = np.linalg.qr(np.column_stack([J, rng.normal(size=40)]))[0][:, 2] * 7
+    for room, freedom in ((1e9, 38), (0.0, 39)):
+        held = r + (room == 0) * 0.1 * J[:, 0]
+        problem = SimpleNamespace(
+            observations=[seen],
+            rows=[slice(0, 40)],
+            sigmas=[jnp.ones(())],
+            parameters=(),
+            room=lambda z, room=room: jnp.full((2, 2), 1e9).at[0, 0].set(room),
+        )
+        search = SimpleNamespace(failure=None, seen=SimpleNamespace(residuals=held, jacobian=J), z=jnp.zeros(2))
+        ((_, factor, found),) = minimum_of(problem, search).noise
+        assert found == pytest.approx(freedom)
+        assert factor == pytest.approx(np.sqrt((held**2).sum() / freedom))
+
+
+def test_what_moves_a_minimum_and_each_observations_noise_add_up():
+    """Covariances by numbers: of two observations, the noise of one known from few residuals to be three times as
+    large in its square, and Σ Δ Δᵀ/4; the degrees of freedom of an error, and of a new measurement of the second."""
+    rng = np.random.default_rng(5)
+    J, moved, g, sigma = rng.normal(size=(30, 2)), 0.1 * rng.normal(size=(2, 2)), np.array([1.0, -2.0]), 0.2
+    rows = slice(0, 10), slice(10, 30)
+    both = uncertainty(J, 2e-16, [(rows[0], 3.0, 8.0), (rows[1], 1.0, 19.0)], moved)
+    whole = np.linalg.inv(J.T @ J)
+    parts = [c * whole @ J[k].T @ J[k] @ whole for c, k in zip((3, 1), rows, strict=True)] + [moved.T @ moved / 4]
+    assert np.allclose(both.inverse, sum(parts), rtol=1e-12)
+    variances = np.array([g @ part @ g for part in parts])
+    error, freedom = both.of(g)
+    assert error == pytest.approx(np.sqrt(variances.sum()))
+    assert freedom == pytest.approx(variances.sum() ** 2 / (variances[0] ** 2 / 8 + variances[1] ** 2 / 19))
+    new = variances + np.array([0, sigma**2, 0])
+    known = new.sum() ** 2 / (new[0] ** 2 / 8 + new[1] ** 2 / 19)
+    band = banded(both, 0.95, 1.0, g, np.asarray(sigma), 1)
+    assert band.new_upper == pytest.approx(1 + t.ppf(0.975, known) * np.sqrt(new.sum()))
+
+
+def test_a_number_lies_at_a_bound_within_a_hundredth_of_its_error():
+    r, J = np.array([1.0, 2.0, 0.5, 1.0]), np.ones((4, 1))
+    error = np.sqrt((r**2).sum() / 3) / 2
+    for share, held in ((0.9e-2, True), (1.1e-2, False)):
+        assert at_bound(r, J, np.array([[share * error], [1e9]])) == held
+    assert not at_bound(r, J, np.array([[1e9], [0.0]]))  # which the data do not want

@@ -172,14 +172,15 @@ def test_correlated_numbers_are_worth_what_theory_says():
 
 @pytest.mark.parametrize("weight", [1.0, 4.0])
 def test_what_a_misfit_adds_to_errors_goes_with_the_weight_of_its_squares(weight):
-    """Sequences that err alike, by their strongest mode; one whose neighbours do, by what it is worth."""
+    """Sequences that err alike, by the strongest mode of what twice the spacing does not explain; one whose neighbours
+    do, by what it is worth."""
     rng = np.random.default_rng(2)
     common = rng.normal(size=(40, 1)) + 0.1 * rng.normal(size=(40, 20))
-    for r, wanted in ((common, strongest_mode(common)), (autoregressive(rng, 60, 0.9)[:, None], None)):
+    for r, wanted in ((common, strongest_mode(0.8 * common)), (autoregressive(rng, 60, 0.9)[:, None], None)):
         seen = mpm.Series(np.arange(1.0, len(r) + 1), 0 * r, spread, weight=weight)
         problem = SimpleNamespace(observations=[seen], rows=[slice(0, r.size)], dtype=np.float64)
         weighed, J = np.sqrt(weight) * r.reshape(-1), np.sqrt(weight) * np.ones((r.size, 1))
-        _, _, (_, wider, _) = _judged(problem, 0, [(0.1, 1.0, r.size - 1.0)], weighed, J, weighed)
+        _, _, (_, wider, _) = _judged(problem, 0, [(0.1, 1.0, r.size - 1.0)], weighed, J, 0.8 * weighed)
         if wanted is None:
             wanted = shape_of(r)[0] * min((r**2).sum() / (r.size - 1), 1)
         assert wanted > 3

@@ -1,6 +1,7 @@
 """Fluids at colliders askew and curved, which may be left or not: nodes behind the surface follow those before it."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -10,7 +11,10 @@ import pytest
 from helpers import assert_close, slow, thorough
 
 import mpmjax as mpm
-from mpmjax.potential import surface_image, with_one_mass
+from mpmjax.boundary._contact import ConstrainedNodes
+from mpmjax.boundary._flow_contact import FlowContact
+from mpmjax.implicit import Projection
+from mpmjax.potential import Mirror, surface_image, with_one_mass
 
 DX, G, WATER = 1 / 16, 10.0, 1e3
 LEFT, SLIP, STICKY = mpm.SeparatingCollider, mpm.SlipCollider, mpm.StickyCollider
@@ -79,6 +83,7 @@ def test_water_rests_in_a_vessel_askew_or_curved(wall, kind, cells, times, d):
     assert float(jnp.abs(part @ (final.x[:, 1] - body.x[:, 1]))) < 1e-3 * deep
 
 
+@eqx.filter_jit
 def slope(d, n=7, sticks=False):
     """A plane askew through a grid, filled before it: its map, and the grid's nodes."""
     normal = np.array([0.3, 0.8, -0.5])[:d]
@@ -97,7 +102,7 @@ def test_nodes_behind_a_surface_follow_those_before_it(d, sticks):
     """They continue a normal velocity that is linear and vanishes on it, and along it a constant one or, where it
     sticks, such a one too. Folded masses are those of momentum along it, and as much as BᵀMB or more; scaled they are
     one in all directions."""
-    image, nodes, distance, normal = eqx.filter_jit(slope)(d, sticks=sticks)
+    image, nodes, distance, normal = slope(d, sticks=sticks)
     rng, n = np.random.default_rng(0), len(nodes)
     along = jnp.asarray(rng.normal(size=d))
     along = along - normal * (normal @ along)
@@ -121,6 +126,39 @@ def test_nodes_behind_a_surface_follow_those_before_it(d, sticks):
     assert np.linalg.eigvalsh(excess).min() > -1e-12
     field = jnp.asarray(rng.normal(size=(n, d)))
     assert_close(jax.jit(lambda u: images.images[0].vector(images.unscaled(u)))(field), field, 1e-12)
+
+
+def test_friction_and_gap_of_what_flows_are_relative_to_the_surface():
+    """Of places that are held and pushed friction takes the share μ r/(m s) of the slip, by the map's weights as a
+    matrix; a velocity that is linear across the surface leaves no place, one that followers exceed along n all."""
+    at_rest, nodes, distance, normal = slope(2)
+    rng, n, moving = np.random.default_rng(0), len(nodes), jnp.asarray([0.3, -0.7])
+    image = dataclasses.replace(at_rest, velocity=jnp.broadcast_to(moving, nodes.shape))
+    mass, active = jnp.asarray(rng.random(n)) + 0.1, jnp.asarray(rng.random(n) < 0.7)
+    of_all = SimpleNamespace(mass=mass, projection=Projection(jnp.ones((n, 2), bool)), free_normals=())
+    held = ConstrainedNodes(of_all, (active,), Mirror(()), of_all)
+    contact = FlowContact(image, 0.3, jnp.ones(n, bool))
+
+    @jax.jit
+    def told(v, residual):
+        made, follows = distance[:, None] * normal + moving, image.follows[:, None].astype(float)
+        gaps = [contact.gap_velocity(held, made + k * follows * normal) for k in (0.0, 1.0)]
+        return at_rest.mean(jnp.eye(n)), gaps, contact.friction(held, active, residual)(v)
+
+    v, residual = jnp.asarray(rng.normal(size=(n, 2))), jnp.asarray(rng.normal(size=(n, 2))) + normal
+    weights, (none, leaving), change = map(np.asarray, told(v, residual))
+    height = np.asarray(image.height)
+    followed = weights.any(axis=0)
+    assert_close(none + 1, np.ones(n), 1e-12)
+    assert (leaving[followed] > 0).all()
+    arm = 1 - height[:, None] / np.where(followed, height, 1)
+    push = (weights * arm).T @ np.asarray(residual @ normal)
+    assert (push[followed & active] < 0).any()
+    slip = np.asarray(v - moving) @ (np.eye(2) - np.outer(normal, normal))
+    limit = 0.3 * np.where(active, np.maximum(push, 0), 0)
+    share = np.minimum(1, limit / (np.asarray(mass) * np.linalg.norm(slip, axis=1)))
+    assert 0 < share[share > 0].min() < share.max() == 1
+    assert_close(change, -share[:, None] * slip, 1e-12)
 
 
 PLANE = mpm.HalfSpace((0.3, 0.31), (-0.6, 0.8))

@@ -1,17 +1,20 @@
 """The implicit updates: what they solve, how they relate, and what they report."""
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import pytest
 from helpers import ELASTIC, LAWS, assert_close, block, explicit_limit, ids, thorough
 from numpy_oracle import grid_update, stress
 
 import mpmjax as mpm
-from mpmjax.implicit import SolveInfo, StageProblem
+from mpmjax._types import Array
+from mpmjax.implicit import ImplicitOperator, Projection, SolveInfo, StageProblem, no_solve, solve
 from mpmjax.implicit._newton import MOST_HALVINGS, backtrack
 
 TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
@@ -438,3 +441,194 @@ def test_the_line_search_takes_the_first_sufficient_decrease(name):
     size, halvings = backtrack(merit, jnp.asarray(3.0), jnp.asarray(-1.0), jnp.asarray(slack))
     assert halvings == wanted
     assert size == 0.5**wanted
+
+
+class Curvature(ImplicitOperator):
+    """A small dense matrix."""
+
+    def precomputed(self):
+        return self
+
+    def diagonal(self):
+        return jnp.abs(jnp.diag(self.hessian)).reshape(self.projection.free.shape)
+
+    def unconstrained(self, v):
+        return (self.hessian @ v.reshape(-1)).reshape(v.shape)
+
+
+class OneEquation(StageProblem):
+    """E'(v) = 0 of a polynomial E that nothing admits outside of an interval, beside an inertial velocity a."""
+
+    polynomial: Array
+    admitted: Array
+
+    def __init__(self, polynomial, admitted, a):
+        one, every = jnp.ones(()), Projection(jnp.ones((1, 1), bool))
+        self.polynomial, self.admitted, self.projection = polynomial, admitted, every
+        self.mass, self.inertial, self.stage_dt, self.spacing, self.theta = one[None], a[None, None], one, one, one
+        self.initial_displacement = self.force = self.potential = self.prescribed = self.action = self.hessian = None
+        self.preconditioner = mpm.implicit.MassPreconditioner()
+
+    def at(self, v, order=0):
+        return jnp.polyval(self.polynomial if order == 0 else jnp.polyder(self.polynomial, order), v)
+
+    def incremental_potential(self, v):
+        low, high = self.admitted
+        return jnp.where((v >= low) & (v <= high), self.at(v), jnp.nan)[0, 0]
+
+    def momentum_residual(self, v):
+        return self.at(v, 1)
+
+    def operator(self, v, hessian=None):
+        return Curvature(self.mass, 1.0, self.at(v, 2), self.projection)
+
+
+class Dense(mpm.implicit.AbstractInnerProductSolver):
+    """The solution of a dense system, of which it says what it is told to say."""
+
+    converges: Array
+    indefinite: Array | bool = False
+    nearly: Array | bool = False
+
+    def init(self, operator, options):
+        return operator
+
+    def compute(self, state, vector, options):
+        x = jnp.linalg.solve(state.as_matrix(), vector.reshape(-1)).reshape(vector.shape)
+        result = lx.RESULTS.where(self.converges, lx.RESULTS.successful, lx.RESULTS.stagnation)
+        stats = {"num_steps": 1, "residual": 0.5, "spectral_radius": 1.0}
+        stats |= {"nearly_converged": self.nearly, "indefinite": self.indefinite}
+        return x, result, jax.tree.map(jnp.asarray, stats)
+
+    def transpose(self, state, options):
+        return state, options
+
+    conj = transpose
+
+    def assume_full_rank(self):
+        return True
+
+
+WELLS, QUARTIC = (0.25, 0.0, -0.5, 0.3, 0.0), (0.25, 0.0, 0.0, -1.0, 0.0)
+PARABOLA, HILL, STEEP = (0.0, 0.0, 0.5, -1.0, 0.5), (0.0, 0.0, -0.5, 1.0, -0.5), (0.0, 0.0, 0.0, np.inf, 0.0)
+ANY, LARGE, EXACT = (-np.inf, np.inf), 1e12, 1e-20
+"""Beside an inertial velocity of 1e12 a residual of 8e-4 is rounding."""
+ENDS = {
+    # E, where it is admitted, a, the guess, rtol, whether linear solves converge, and whether one meets a negative
+    # curvature; the solution, Newton steps, halvings, whether it converged, and nearly
+    "rest is lower, and E falls to its left": (
+        (WELLS, ANY, 1.0, 2.0, 1e-12, True, True),
+        (-1.12541878, 7, 0, True, False),
+    ),
+    "rounding": ((QUARTIC, (0.5, 2.0), LARGE, 1.015, EXACT, True, False), (1.000221, 1, 0, True, False)),
+    "rounding, where E was concave": ((QUARTIC, (0.5, 2.0), LARGE, 1.015, EXACT, True, True), (1, 2, 0, True, False)),
+    "rounding, by a poor step": ((QUARTIC, (0.5, 2.0), LARGE, 1.0002, EXACT, False, True), (1, 3, 0, True, False)),
+    "rounding, by half a step": (
+        (PARABOLA, (0.5, 1 - 1e-4), LARGE, 1 - 2e-4, EXACT, True, True),
+        (0.9999, 2, 31, False, False),
+    ),
+    "rounding, uphill": ((HILL, (0.5, 2.0), LARGE, 1 + 1e-4, EXACT, True, True), (2, 30, 269, False, False)),
+    "nothing beyond is admitted": ((PARABOLA, (0.0, 0.5), 5.0, 0.5, 1e-9, True, True), (0.5, 1, 30, False, False)),
+    "nor is it, within ten times": ((PARABOLA, (0.0, 0.5), 5.0, 0.5, 0.0501, True, True), (0.5, 1, 30, False, True)),
+    "nor is it, beyond that": ((PARABOLA, (0.0, 0.5), 5.0, 0.5, 0.0499, True, True), (0.5, 1, 30, False, False)),
+    "not finite": ((STEEP, ANY, 1.0, 0.5, 1e-12, True, True), (np.nan, 0, 0, False, False)),
+}
+
+
+@jax.jit
+def solved(polynomial, admitted, a, guess, rtol, converges, indefinite):
+    newton = mpm.implicit.Newton(Dense(converges, indefinite), rtol)
+    v, info = newton(OneEquation(polynomial, admitted, a), guess[None, None])
+    return (v[0, 0], info.newton, info.line_search, info.converged, info.nearly_converged), info.residual
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_newton_ends_at_a_solution_or_says_that_it_does_not(name):
+    """Where it starts, which way it goes, and what it takes for rounding, of one equation. The residual is relative to
+    that of rest or to the inertia."""
+    given, wanted = ENDS[name]
+    found, residual = solved(*map(jnp.asarray, given))
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    if np.isfinite(wanted[0]):
+        slope = np.polyder(given[0])
+        size = max(abs(slope[-1]), given[2])
+        np.testing.assert_allclose(residual, abs(np.polyval(slope, float(found[0]))) / size, rtol=1e-6)
+
+
+class Sliding(StageProblem):
+    """A v = f of one node along a surface at an angle to x, across which it has a speed, or none as at rest."""
+
+    A: Array
+    f: Array
+
+    def __init__(self, q, rests):
+        self.A, (*f, angle, speed), one = jnp.asarray([[3.0, 1.0], [1.0, 2.0]], q.dtype), q, jnp.ones((), q.dtype)
+        normal = jnp.stack([-jnp.sin(angle), jnp.cos(angle)])[None]
+        self.f, self.projection = jnp.stack(f), Projection(jnp.ones((1, 2), bool), (normal,))
+        self.prescribed = None if rests else speed * normal
+        self.mass, self.preconditioner = one[None], mpm.implicit.MassPreconditioner()
+        self.inertial = self.stage_dt = self.spacing = self.initial_displacement = self.force = self.potential = None
+        self.hessian = self.theta = self.action = None
+
+    def momentum_residual(self, v):
+        return (self.A @ v[0] - self.f)[None]
+
+    def operator(self, v, hessian=None):
+        return Curvature(self.mass, 1.0, self.A, self.projection)
+
+    def exact(self):
+        normal = self.projection.normals[0][0]
+        along = jnp.stack([normal[1], -normal[0]])
+        held = 0 * normal if self.prescribed is None else self.prescribed[0]
+        return held + along * (along @ (self.f - self.A @ held)) / (along @ self.A @ along)
+
+
+def solved_exactly(problem, guess):
+    return problem.exact()[None], no_solve(guess.dtype)
+
+
+def ruled(q, rests, adjoint):
+    """The solution, and the report of the tangent solve."""
+    v, info = solve(Sliding(q, rests), jnp.zeros((), q.dtype), jnp.zeros((1, 2), q.dtype), solved_exactly, adjoint)
+    return v[0], info.report
+
+
+@partial(jax.jit, static_argnums=0)
+def differentiated(rests, q, dq, converges, nearly):
+    """The tangent of the solution and of the report by the rule, the pull-back of a cotangent, and the Jacobian."""
+    by_rule = lambda q: ruled(q, rests, Dense(converges, nearly=nearly))  # noqa: E731
+    pulled = jax.vjp(lambda q: by_rule(q)[0], q)[1](COTANGENT)[0]
+    return *jax.jvp(by_rule, (q,), (dq,))[1], pulled, jax.jacfwd(lambda q: Sliding(q, rests).exact())(q)
+
+
+COTANGENT = jnp.asarray([1.0, -2.0])
+
+
+@pytest.mark.parametrize("rests", [True, *thorough(False)])
+def test_the_derivative_of_a_stage_is_that_of_its_solution_or_none(rests):
+    """By force, normal and speed of what holds a node. A tangent solve that ends nearly at its tolerance is taken; of
+    one that does not there is NaN and a report, none of those after it."""
+    q, dq = jnp.asarray([1.0, -0.5, 0.3, 0.7]), jnp.asarray([0.2, 0.4, -0.3, 0.5])
+    for nearly in (False, True):
+        change, report, pulled, exact = differentiated(rests, q, dq, jnp.asarray(not nearly), jnp.asarray(nearly))
+        assert_close(change, exact @ dq, 1e-13)
+        assert_close(pulled, COTANGENT @ exact, 1e-13)
+        assert report == 0
+    for direction, told in ((dq, 0.5), (jnp.nan * dq, 0.0)):
+        change, report, pulled, _ = differentiated(rests, q, direction, jnp.asarray(False), jnp.asarray(False))
+        assert np.isnan([*change, *pulled[:2]]).all()
+        assert report == told
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [("float32", 1e-6), ("float64", 1e-8)])
+def test_a_derivative_is_asked_for_to_six_digits_or_more(dtype, rtol):
+    asked = []
+
+    class Asked(Dense):
+        def compute(self, state, vector, options):
+            asked.append(options["rtol"])
+            return super().compute(state, vector, options)
+
+    q = jax.ShapeDtypeStruct((4,), dtype)
+    jax.eval_shape(lambda q: jax.jvp(lambda q: ruled(q, True, Asked(jnp.asarray(True))), (q,), (q,)), q)
+    assert set(asked) == {rtol}

@@ -172,11 +172,28 @@ def yield_excess(name, mean, deviation, before, after, flowed=0.0):
     return 1.6 * q**2 + 1.2**2 * (p + 0.3 * p0) * (p - p0)
 
 
+def remembered(name, mean, deviation, before, after_mean, flowed):
+    """The history's scalar after a return from a trial state: what has flowed, or the volume that was given up; for Cam
+    clay that on the straight way to the ellipse's centre where e is shortened."""
+    if name in {"von_mises", "herschel_bulkley"}:
+        return before + np.sqrt(2 / 3) * flowed
+    change = 3 * (mean - after_mean)
+    if name == "cam_clay":
+        p0 = np.sinh(2.0 * np.maximum(-before, 0))
+        centre, inside, outside = -(1 - 0.3) * p0 / 6, 0.0, 1.0
+        for _ in range(60):
+            way = (inside + outside) / 2
+            beyond = yield_excess(name, centre + way * (mean - centre), way * deviation, before, before) > 0
+            inside, outside = np.where(beyond, inside, way), np.where(beyond, way, outside)
+        change = np.where((-3 * mean > p0) | (-3 * mean < -0.3 * p0), change, 3 * (1 - outside) * (mean - centre))
+    return before + change
+
+
 @EACH_LAW
 @EACH_DIM
 def test_a_return_meets_the_yield_condition_and_lowers_the_energy(name, d):
-    """From 300 random trial states: the condition holds after it, by NumPy's singular values; Ψ has not grown, and F
-    and history are to the last bit as before where the condition held."""
+    """From 300 random trial states: the condition holds after it, by NumPy's singular values; Ψ has not grown, the
+    history remembers what flowed, and F and history are to the last bit as before where the condition held."""
     law = law_of(name)
     F, history = random_states(name, d)
     after, new, energy_before, energy = return_map(law, F, history)
@@ -186,6 +203,7 @@ def test_a_return_meets_the_yield_condition_and_lowers_the_energy(name, d):
     flowed = np.maximum(tried[1] - deviation, 0)
     assert (yield_excess(name, mean, deviation, before, then, flowed) < 1e-14).all()
     assert (energy <= energy_before * (1 + 1e-13)).all()
+    np.testing.assert_allclose(then, remembered(name, *tried, before, mean, flowed), rtol=0, atol=1e-12)
     trial = yield_excess(name, *tried, before, before)
     elastic = (trial < -1e-13) & ((before == 0) if name == "drucker_prager" else True)
     assert 10 < elastic.sum() < 290
@@ -549,6 +567,8 @@ def test_clay_compacts():
     law = with_parameters("cam_clay", hardening=0.5)
     start = float(law.initial_history(jnp.eye(3)[..., None]).volume_strain[0])
     np.testing.assert_allclose(K * np.sinh(-0.5 * start), 300, rtol=1e-14)
+    moved = replace(law.initial_history(jnp.eye(3)[..., None]), volume_strain=start + jnp.asarray([-0.2, 0.3]))
+    np.testing.assert_allclose(law.compaction(moved), [np.exp(-0.2), 1], rtol=1e-14)  # what has loosened counts as one
     total, found = -0.6, []
     for steps in (1000, 2000):
         _, history, stress = stretched(law, np.full((steps, 3), total / 3 / steps))
@@ -630,13 +650,17 @@ def test_bad_parameters_are_refused(name, values, message):
 @pytest.mark.parametrize("d", [2, *thorough(3)])
 def test_sand_closes_when_the_gap_is_used_up(d):
     """The mean strain of the return map is m + v_c/3: equal strains of −0.03, and gaps that leave −0.01 and +0.01 of it
-    (in plane strain the third one is the history's)."""
-    law, gap = PLASTIC["drucker_prager"], jnp.asarray([0.06, 0.12])
-    F = jnp.exp(-0.03) * jnp.repeat(jnp.eye(d)[..., None], 2, axis=-1)
-    start = law.initial_history(F)
-    history = replace(start, gap=gap, transverse_strain=None if d == 3 else jnp.full(2, -0.03))
-    returned, after = jax.jit(law.return_map)(F, history, 1.0)
-    np.testing.assert_allclose(after.gap, [0, 0.03], atol=1e-15)
-    np.testing.assert_allclose(returned[0, 0], np.exp([-0.01, 0]), rtol=1e-14)
+    (in plane strain the third one is the history's); likewise at rest. A further shear strains what has closed, and not
+    what is apart."""
+    law, gap = PLASTIC["drucker_prager"], jnp.asarray([0.06, 0.12, 0.03])
+    strain = jnp.asarray([-0.03, -0.03, 0.0])
+    F = jnp.exp(strain) * jnp.eye(d)[..., None]
+    history = replace(law.initial_history(F), gap=gap, transverse_strain=None if d == 3 else strain)
+    shear = jnp.ones(F.shape) - jnp.eye(d)[..., None]
+    returned_and_strained = jax.jit(lambda F: jax.jvp(lambda F: law.return_map(F, history, 1.0), (F,), (shear,)))
+    (returned, after), (strained, _) = returned_and_strained(F)
+    np.testing.assert_allclose(strained, shear * jnp.asarray([np.exp(0.02), 0, 0]), atol=1e-15)
+    np.testing.assert_allclose(after.gap, [0, 0.03, 0.03], atol=1e-15)
+    np.testing.assert_allclose(returned[0, 0], np.exp([-0.01, 0, 0]), rtol=1e-14)
     if d == 2:
-        np.testing.assert_allclose(after.transverse_strain, [-0.01, 0], atol=1e-15)
+        np.testing.assert_allclose(after.transverse_strain, [-0.01, 0, 0], atol=1e-15)

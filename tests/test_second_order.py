@@ -1,14 +1,18 @@
 """`ImplicitMidpoint` and `TRBDF2`: their steps, how they damp, what they conserve."""
 
+from dataclasses import replace
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, VISCOUS, assert_close, explicit_limit, ids, thorough
+from helpers import DESCRIPTIONS, VISCOUS, assert_close, block, explicit_limit, ids, thorough
 from numpy_oracle import grid_update
 from test_implicit import jolted
 
 import mpmjax as mpm
+from mpmjax._types import Array
 from mpmjax.implicit import ImplicitOperator, Projection
 from mpmjax.stepping import NodeMotion, reaction
 
@@ -199,6 +203,41 @@ def test_a_motion_counts_half_of_what_slows_it():
     slowed = mpm.ImplicitMidpoint().with_friction(NodeMotion(one, one), -one)
     assert (slowed.carrier == 0.5).all()
     assert (slowed.velocity == 0).all()
+    at_end = mpm.TRBDF2(0.3).with_friction(NodeMotion(one, one), -one)
+    np.testing.assert_allclose(at_end.carrier, 1 - mpm.TRBDF2(0.3).weights()[3], rtol=1e-14)
+
+
+class Kick(eqx.Module):
+    """Contacts in an inner stage that change all velocities at its end."""
+
+    by: Array
+
+    def change(self, share):
+        return None
+
+    def friction(self, method, v, u, share):
+        return self.by
+
+
+@pytest.mark.parametrize("method", [METHODS["trbdf2"], METHODS["implicit_midpoint"], mpm.SemiImplicit(0.6, SOLVER)])
+def test_free_nodes_feel_what_a_step_tells_of_viscosity_and_of_an_inner_stage(method):
+    """Beside gravity and the elastic impulse. TR-BDF2 keeps a part of what rubs at its first stage."""
+    scene, particles = block(1, side=2, gravity=(-9.81,), material=VISCOUS["viscous_solid"])
+    particles = replace(particles, v=particles.x)
+    nodes = grid_update(scene, particles, 3 * explicit_limit(block(1)[0]), mpm.Explicit()).nodes
+    kick = jnp.where(nodes.occupied, jnp.linspace(0.2, 0.5, len(nodes.mass))[:, None], 0)
+
+    @jax.jit
+    def missing(nodes, kick):
+        motion, _ = method.advance(replace(nodes, inner=Kick(kick)), nodes.velocity)
+        kept = 0 * kick if motion.friction is None else motion.friction
+        told = replace(motion, velocity=motion.velocity - kept)
+        return kept, reaction(nodes, told, method.elastic_impulse(nodes, motion))
+
+    kept, left = missing(nodes, kick)
+    assert np.abs(left).max() < 1e-11 * float(nodes.mass.max())
+    if isinstance(method, mpm.TRBDF2):
+        assert_close(kept, method.weights()[2] / method.weights()[3] * kick, 1e-13)
 
 
 FLOORS = {

@@ -176,9 +176,11 @@ def test_an_explicit_blow_up_is_stopped_and_named():
     scene, particles = pulled()
     dt = 3 * explicit_limit(scene)
     with pytest.raises(mpm.SimulationError, match=r"At step \d+ \(t = [\d.]+ s\) particle \d+") as caught:
-        mpm.simulate(scene, particles, t1=400 * dt, dt=dt)
+        mpm.simulate(scene, particles, t1=400 * dt, dt=dt, save_every=1)
     run = caught.value.run
     step = int(run.final_step)
+    assert_equal(run.frames.x[-1], run.final.x)
+    np.testing.assert_array_equal(run.steps, np.arange(step + 1))
     assert f"At step {step + 1} " in str(caught.value)
     assert f"t = {(step + 1) * dt:.6g} s" in str(caught.value)
     assert all(np.isfinite(leaf).all() for leaf in state(run.final))
@@ -271,6 +273,23 @@ def test_advice_weighs_the_step_against_the_limit_of_the_method_there_and_then()
     torn = eqx.tree_at(lambda p: p.F, rest, 1e200 * rest.F)  # its limit overflows
     assert advice(0.6 * limit, torn) == "Look there."
     assert "2 times" in advice(2 * limit, torn)
+
+
+def test_advice_is_by_the_shorter_of_the_limits_at_the_start_and_at_the_end(monkeypatch):
+    """From seven tenths of it on; where there is none at the end, by that at the start."""
+    scene, rest = breathing(LAWS["neo_hookean"])
+
+    def advice(dt, *limits):
+        left = iter(limits)
+        monkeypatch.setattr("mpmjax.simulation._faults.longest_step", lambda *_: next(left))
+        return advise(scene, mpm.Explicit(), dt, rest, rest, "Look there.")
+
+    for dt, first, then in ((0.69, 1.0, 1.0), (0.34, 1.0, 0.5), (0.34, 0.5, 1.0), (0.69, 1.0, np.nan), (9, 0.0, 1.0)):
+        assert advice(dt, first, then) == "Look there."
+    near, late, over = advice(0.8, 1.0, 1.0), advice(0.6, 1.0, 0.5), advice(1.1, 1.0, np.nan)
+    assert "0.8 times the explicit limit at the start (1 s); from 0.7 times on" in near
+    assert "and 1.2 times that of the last good state (0.5 s). Take a dt of less" in late
+    assert "Take a dt of at most 0.7 s" in over
 
 
 @pytest.mark.parametrize(

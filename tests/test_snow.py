@@ -1,5 +1,7 @@
 """Snow: its return map against the singular values, closed forms of element tests, and its derivatives."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -153,14 +155,18 @@ def derivatives(place, t, u):
 EXACTLY = {"stretched alike": (1.02, 1.02, 1.02), "pressed alike": (0.95, 0.95, 0.95), "at rest": (1.0, 1.0, 1.0)}
 
 
-@pytest.mark.parametrize("stretches", [*EXACTLY.values(), (0.94, 1.0, 1.03), (0.93, 0.95, 0.99)])
+BEYOND_BOTH = (0.9997, 1.0003, 0.9996)  # the limits of snow that yields at once
+
+
+@pytest.mark.parametrize("stretches", [*EXACTLY.values(), (0.94, 1.0, 1.03), (0.93, 0.95, 0.99), BEYOND_BOTH])
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_derivatives_of_the_return_map_are_central_differences(d, stretches):
-    """By F, history and all parameters, at repeated stretches too; the transpose is the transpose, and second
-    derivatives are differences of first ones."""
+    """By F, history and all parameters, at repeated stretches too, and at near ones that are clamped to either limit;
+    the transpose is the transpose, and second derivatives are differences of first ones."""
     rng = np.random.default_rng(4)
     F = jnp.asarray(rotation_matrix(d, rng) * np.array(stretches[:d]) @ rotation_matrix(d, rng))[..., None]
-    place = (SNOW, F, SnowHistory(jnp.asarray([0.9])))
+    snow = dataclasses.replace(SNOW, critical_compression=1e-4, critical_stretch=1e-4)
+    place = (snow if stretches is BEYOND_BOTH else SNOW, F, SnowHistory(jnp.asarray([0.9])))
     place = jax.tree.map(lambda a: jnp.asarray(a, float), place)
     t = jax.tree.map(lambda a: jnp.asarray(a * rng.normal(size=a.shape) * 0.3), place)
     t = (t[0], jnp.asarray(0.1 * rng.normal(size=F.shape)), t[2])

@@ -140,7 +140,7 @@ class Newton(AbstractStageSolver):
             line_search=c.halvings,
             residual=left / jnp.where(size == 0, 1, size),
             converged=done,
-            nearly_converged=~done & (left <= NEARLY_CONVERGED * rtol * scale),
+            nearly_converged=~done & jnp.isfinite(left) & (left <= NEARLY_CONVERGED * rtol * scale),
             indefinite=c.indefinite,
             report=jnp.zeros_like(left),
         )

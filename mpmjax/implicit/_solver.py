@@ -244,7 +244,7 @@ def _outcome(end: Iterate, rtol: Scalar, max_steps: int) -> tuple[lx.RESULTS, di
         "residual": residual / jnp.where(end.b_norm == 0, 1, end.b_norm),
         "spectral_radius": end.radius,
         "indefinite": end.indefinite,
-        "nearly_converged": ~converged & (residual <= NEARLY_CONVERGED * tolerance),
+        "nearly_converged": ~converged & finite & (residual <= NEARLY_CONVERGED * tolerance),
     }
 
 

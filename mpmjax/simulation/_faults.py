@@ -141,9 +141,8 @@ def guarded(run: Run, report: Array) -> Run:
     names: list[str] = []
     jax.eval_shape(lambda a: names.extend(r.message for r in requirements(eqx.combine(a, rest))), inputs)
     statistics = run.statistics
-    unsolved = (statistics.fault == Fault.NONE) & (statistics.unconverged > 0)
     states = [(state, statistics.fault == fault) for fault, (state, *_) in _WORDS.items()]
-    states.append(("a solve that did not converge", unsolved))
+    states.append(("a solve that did not converge", statistics.unconverged > 0))  # after what is graver
     met = jnp.stack([holds for _, holds in states])
     number = jnp.where(met.any(), 1 + jnp.argmax(met).astype(jnp.int32), 0)
     number = jnp.where(statistics.unmet > 0, len(states) + statistics.unmet, number)
