@@ -43,6 +43,7 @@ FEATURES = {
     "spring": {"loads": mpm.Spring(mpm.PointsAt(((0.1, 0.1),)), 1e2, 1.0)},
     "couple": {"loads": mpm.Couple(TOP, 1.0)},
     "fluid": {"material": mpm.Fluid(1e5)},
+    "corrected": {"material": mpm.Fluid(1e5), "correction": mpm.extensions.DensityCorrection()},
     "metal": {"material": mpm.VonMises(1e5, 0.3, 1e3)},
     "viscous": {"material": mpm.Viscous(LAWS["neo_hookean"], 1.0)},
     "rigid body": {"material": mpm.Rigid(1e5)},

@@ -118,6 +118,7 @@ EXAMPLES = {
     mpm.implicit.JvpHessian: mpm.implicit.JvpHessian(),
     mpm.implicit.ConjugateResidual: mpm.implicit.ConjugateResidual(1e-7, increment_rtol=1e-3, max_steps=17),
     mpm.AveragedVolume: mpm.AveragedVolume((0, 1)),
+    mpm.extensions.DensityCorrection: mpm.extensions.DensityCorrection(mpm.Box((0.0, 0.1), (1.0, 1.1)), 2.0, 0.1),
     mpm.implicit.DiagonalPreconditioner: mpm.implicit.DiagonalPreconditioner(),
     mpm.implicit.MassPreconditioner: mpm.implicit.MassPreconditioner(),
     mpm.extensions.VolumePreconditioner: mpm.extensions.VolumePreconditioner(1000, extent=(5, 6)),

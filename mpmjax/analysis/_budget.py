@@ -209,8 +209,8 @@ def budget(
         the particles after the last step, and the budget, each of its terms with a leading axis f.
 
     Raises:
-        ValueError: from `prepare`, a step that is not positive, a plane that mirrors and moves, or a body under
-            a constraint, such as a rigid one.
+        ValueError: from `prepare`, a step that is not positive, a plane that mirrors and moves, a body under
+            a constraint, such as a rigid one, or a correction.
     """
     require_positive("dt [s]", dt, particles.x.dtype)
     steps, start = require_whole("steps", steps, 1), require_whole("start", start, 0)
@@ -225,6 +225,7 @@ def budget(
         "A budget does not know the work of a SymmetryPlane or ClampPlane that moves: take one at rest, in its own "
         "frame, a SlipCollider of a HalfSpace, or a Grip.",
     )
+    require(scene.correction is None, "A budget does not know the work of a correction: take the scene without.")
     scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
     return _budget(scene, prepare(scene, particles), jnp.asarray(start, particles.x.dtype), dt, method, steps)
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Float, Point, Scalar
+from mpmjax._types import Array, Float, Point, Scalar
 from mpmjax.checks import coordinates, finite, require, require_fields, require_that
 from mpmjax.geometry._motion import turn
 from mpmjax.geometry._region import AbstractRegion, Cells
@@ -47,8 +47,8 @@ class AbstractComposed(AbstractRegion):
     def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
         return jnp.concatenate([region.sides(x) for region in self.regions], axis=1)
 
-    def _each(self, behind: Bool[Array, "m k"]) -> Bool[Array, "r m"]:
-        """Whether points lie in each of the regions, by their `sides`."""
+    def _each(self, behind: Float[Array, "m k"]) -> Float[Array, "r m"]:
+        """`joined` of each of the regions."""
         numbers = [region.sides(jnp.zeros((1, self.dim))).shape[1] for region in self.regions]
         parts = jnp.split(behind, np.cumsum(numbers)[:-1], axis=1)
         return jnp.stack([region.joined(part) for region, part in zip(self.regions, parts, strict=True)])
@@ -66,8 +66,8 @@ class Union(AbstractComposed):
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         return _extreme(jnp.less, self.regions, x)
 
-    def joined(self, behind: Bool[Array, "m k"]) -> Bool[Array, "m"]:
-        return self._each(behind).any(axis=0)
+    def joined(self, behind: Float[Array, "m k"]) -> Float[Array, "m"]:
+        return jnp.minimum(self._each(behind).sum(axis=0), 1)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = zip(*(region.bounds() for region in self.regions), strict=True)
@@ -92,8 +92,8 @@ class Intersection(AbstractComposed):
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         return _extreme(jnp.greater, self.regions, x)
 
-    def joined(self, behind: Bool[Array, "m k"]) -> Bool[Array, "m"]:
-        return self._each(behind).all(axis=0)
+    def joined(self, behind: Float[Array, "m k"]) -> Float[Array, "m"]:
+        return self._each(behind).prod(axis=0)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = zip(*(region.bounds() for region in self.regions), strict=True)
@@ -120,8 +120,8 @@ class Complement(AbstractRegion):
     def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
         return -self.region.sides(x)
 
-    def joined(self, behind: Bool[Array, "m k"]) -> Bool[Array, "m"]:
-        return ~self.region.joined(~behind)
+    def joined(self, behind: Float[Array, "m k"]) -> Float[Array, "m"]:
+        return 1 - self.region.joined(1 - behind)
 
     def middle(self) -> Float[Array, "d"]:
         return self.region.middle()
@@ -168,7 +168,7 @@ class Placed(AbstractRegion):
     def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
         return self.region.sides(self._origin(x))
 
-    def joined(self, behind: Bool[Array, "m k"]) -> Bool[Array, "m"]:
+    def joined(self, behind: Float[Array, "m k"]) -> Float[Array, "m"]:
         return self.region.joined(behind)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Float
+from mpmjax._types import Array, Float
 from mpmjax.checks import canonical, require, require_memory
 from mpmjax.geometry._region import AbstractRegion
 
@@ -48,8 +48,8 @@ def _sides_of(region: AbstractRegion, x: Float[Array, "m d"]) -> tuple[Float[Arr
 
 
 @eqx.filter_jit
-def _joined(region: AbstractRegion, behind: Float[Array, "m k"]) -> tuple[Bool[Array, "m"]]:
-    return (region.joined(behind > 0),)
+def _joined(region: AbstractRegion, behind: Float[Array, "m k"]) -> tuple[Float[Array, "m"]]:
+    return (region.joined((behind > 0).astype(behind.dtype)),)
 
 
 @eqx.filter_jit

@@ -51,10 +51,10 @@ class AbstractRegion(eqx.Module):
         shape (m, k). Default: its own alone."""
         return self.distance(x)[:, None]
 
-    def joined(self, behind: Bool[Array, "m k"]) -> Bool[Array, "m"]:
-        """Whether points lie in the region, shape (m,), by whether each is behind each of its `sides`, shape (m, k).
-        Default: where it is behind all of them."""
-        return behind.all(axis=1)
+    def joined(self, behind: Float[Array, "m k"]) -> Float[Array, "m"]:
+        """How much of a small neighbourhood of points lies in the region, shape (m,), by the shares of it that lie
+        behind each of its `sides`, shape (m, k); of a point alone shares are 0 or 1. Default: sides at right angles."""
+        return behind.prod(axis=1)
 
     def fitted(self, size: np.ndarray) -> Cells | None:
         """Centroids [m], (m, d), and volumes [m^d], (m,), of cells that fill the region to its surface, near `size` in

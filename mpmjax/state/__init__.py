@@ -44,6 +44,7 @@ from mpmjax.state._preparation import (
     velocity_gradient as velocity_gradient,
 )
 from mpmjax.state._scene import (
+    AbstractCorrection as AbstractCorrection,
     AbstractDescription as AbstractDescription,
     Bodies as Bodies,
     Scene as Scene,

@@ -1,5 +1,6 @@
 """The scene: everything that a step needs and does not change, with its description and its bodies."""
 
+import abc
 from dataclasses import replace
 from typing import Annotated, ClassVar
 
@@ -105,6 +106,18 @@ class Bodies(eqx.Module):
         return numbers
 
 
+class AbstractCorrection(eqx.Module):
+    """A change of the particles at the start of each step, such as `extensions.DensityCorrection`."""
+
+    @abc.abstractmethod
+    def check(self, scene: "Scene") -> None:
+        """Raise a `ValueError` if it cannot stand in a scene."""
+
+    @abc.abstractmethod
+    def corrected(self, scene: "Scene", particles: Particles, stencil: Stencil, t: Scalar, dt: Scalar) -> Particles:
+        """Prepared particles as the step from t to t + dt is to find them, where they are, from their stencil."""
+
+
 class Scene(eqx.Module):
     """Grid, law, gravity, boundaries and the choices of discretisation.
 
@@ -125,6 +138,7 @@ class Scene(eqx.Module):
         loads: forces on the body's surface or at points of it, springs and dashpots; see `attach`.
         bodies: which materials are bodies of their own, that touch each other. Default: all share the nodes.
         volume: `AveragedVolume()` for nearly incompressible bodies. Default: each particle has its own volume.
+        correction: a change of the particles at the start of each step. Default: none.
         boundary_forces: whether steps compute the force and torque on each boundary (see `Run.boundary_forces`).
         names: names of the materials, where `material` is no dict. Default: none.
 
@@ -147,6 +161,7 @@ class Scene(eqx.Module):
     loads: tuple[AbstractLoad, ...]
     bodies: Bodies | None
     volume: AveragedVolume | None
+    correction: AbstractCorrection | None
     names: tuple[str, ...] = eqx.field(static=True)
 
     @checked
@@ -166,6 +181,7 @@ class Scene(eqx.Module):
         loads: AbstractLoad | tuple[AbstractLoad, ...] | list[AbstractLoad] = (),
         bodies: Bodies | None = None,
         volume: AveragedVolume | None = None,
+        correction: AbstractCorrection | None = None,
         names: tuple[str, ...] = (),
     ):
         if isinstance(material, dict):
@@ -182,7 +198,7 @@ class Scene(eqx.Module):
         self.transfer, self.description = transfer, description
         self.body_force, self.boundary_forces = body_force, boundary_forces
         self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
-        self.bodies, self.volume = bodies, volume
+        self.bodies, self.volume, self.correction = bodies, volume, correction
 
     def __check_init__(self):
         d = self.grid.dim
@@ -233,6 +249,8 @@ class Scene(eqx.Module):
             )
         if self.volume is not None:
             self.volume.check(self.laws)
+        if self.correction is not None:
+            self.correction.check(self)
         for constraint in self.constraints:
             constraint.check(self)
 

@@ -198,8 +198,8 @@ def warn_of_crowding(scene: Scene, particles: Particles) -> None:
             warn(
                 f"At the end particles take up to {filled[0].max():.2g} times the space that there is, most near "
                 f"{filled[1]} m, and {100 * beyond:.2g} % of their volume is too much where it lies: levels and "
-                "pressures are wrong. Take three particles along a cell, a shorter step, and around what flows a "
-                "SeparatingBox or ContactPlanes."
+                "pressures are wrong. Take three particles along a cell, a shorter step, for a fluid "
+                "correction=extensions.DensityCorrection(room), and around it a SeparatingBox or ContactPlanes."
             )
             return
 

@@ -61,6 +61,9 @@ def step_unchecked(
     force_at = method.force_at()
     if stencil is None:
         stencil = scene.stencil(particles, t)
+    if scene.correction is not None:
+        with jax.named_scope("correction"):
+            particles = scene.correction.corrected(scene, particles, stencil, t, dt)
     with jax.named_scope("p2g"):
         unfolded = nodes = particles_to_grid(
             scene,
