@@ -40,7 +40,7 @@ def test_water_that_fills_a_vessel_has_the_density_one_beside_its_walls(d, at):
     correction = DensityCorrection(room(d, at))
     scene, water = vessel(d, at, correction=correction)
     phi = correction.density(scene, water, scene.stencil(water))
-    deep = np.asarray(water.x[:, -1]) < 0.5 + at * DX - 2 * DX  # below what sees the surface
+    deep = np.asarray(water.x[:, -1]) < 0.5 + at * DX - 3 * DX  # below what sees the surface
     assert float(jnp.abs(phi[deep] - 1).max()) < 0.02 * d  # the kernel sees the lattice of particles
     alone = DensityCorrection().density(scene, water, scene.stencil(water))
     assert float(alone[deep].min()) < 0.75  # without the room what lies at walls looks thin
@@ -48,8 +48,8 @@ def test_water_that_fills_a_vessel_has_the_density_one_beside_its_walls(d, at):
 
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_particles_that_crowd_are_compressed_as_the_formula_says(d):
-    rate, slack, dt, squeeze = 2.0, 0.1, 0.01, 1.6
-    scene, water = vessel(d, correction=DensityCorrection(rate=rate, slack=slack))
+    rate, slack, dt, squeeze = 2.0, 0.4, 0.01, 2.0
+    scene, water = vessel(d, correction=DensityCorrection(room(d), rate, slack))
     C = np.zeros((d, d))
     C[0, -1] = 30.0  # in one dimension an expansion
     sheared = abs(30.0) if d > 1 else 2**0.5 * 30.0
@@ -59,7 +59,7 @@ def test_particles_that_crowd_are_compressed_as_the_formula_says(d):
     assert_close(corrected(scene, water, dt).F, expected)
     assert expected.min() < 0.9
     assert (expected == 1).any()
-    assert float(phi.max()) == pytest.approx(squeeze, rel=0.03)
+    assert float(phi.max()) == pytest.approx(squeeze, rel=0.05)
 
 
 def test_what_rests_or_does_not_crowd_stays_as_it_is():
