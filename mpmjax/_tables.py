@@ -8,7 +8,7 @@ import difflib
 import json
 import math
 import tomllib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import reduce
 from operator import and_, ge, gt, le, lt, or_
 from pathlib import Path
@@ -16,6 +16,9 @@ from typing import Any, TypeGuard
 
 SCHEMA = Path(__file__).with_name("scene.schema.json")
 OPEN = "A class of your own may stand here."  # which the schema says of a place
+ONE = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
+_MANY = {float: "numbers", int: "whole numbers", bool: "true and false", str: "strings"}
+_TYPES = {"number": float, "integer": int, "boolean": bool, "string": str}
 _HOLDS = {"minimum": ge, "maximum": le, "exclusiveMinimum": gt, "exclusiveMaximum": lt}
 
 
@@ -75,8 +78,15 @@ def _check_keys(table: dict[str, Any], schema: dict[str, Any], where: str, kinds
 
 
 def _check_tables(value: Any, schema: dict[str, Any], where: str, kinds: dict[str, Any], more: bool) -> None:
-    """Check the tables in a value by its schema, and its numbers by their bounds. All else is left to who reads it."""
+    """Check the tables in a value by its schema, and the form and bounds of numbers, words and switches. All else is
+    left to who reads it."""
     options, bounds = schema.get("anyOf", [schema]), _bounds(schema)
+    if (forms := _forms(options)) is not None:
+        leaves, words = list(_leaves(value)), [word for option in options for word in option.get("enum", ())]
+        listed = all(leaf in words for leaf, _ in leaves if words and isinstance(leaf, str))
+        fit = listed and any(all(k == depth and fits(leaf, kind) for leaf, k in leaves) for kind, depth in forms)
+        require_in(where, fit, f"must be {in_words(forms, words)}, got {short(value)}")
+        require_in(where, all(leaf == leaf for leaf, _ in leaves), f"must be finite, got {short(value)}")
     inside = not bounds or all(within(number, bounds) for number in _numbers(value))
     require_in(where, inside, f"{schema.get('description')}, got {short(value)}")
     objects = {option["$ref"].removeprefix("#/$defs/"): option for option in options if "$ref" in option}
@@ -101,6 +111,44 @@ def _check_tables(value: Any, schema: dict[str, Any], where: str, kinds: dict[st
             _check_keys(_without_kind(value), table, where, kinds, more)
 
 
+def _forms(options: list[dict[str, Any]]) -> set[tuple[type, int]] | None:
+    """Kind and depth of lists of the numbers, words and switches that options are; None where one is another thing."""
+    forms = set()
+    for option in options:
+        depth = 0
+        while option.get("type") == "array" and "items" in option:
+            option, depth = option["items"], depth + 1
+        kind = str if "enum" in option else _TYPES.get(str(option.get("type")))
+        if kind is None:
+            return None
+        forms.add((kind, depth))
+    return forms or None
+
+
+def _leaves(value: Any, depth: int = 0) -> Iterator[tuple[Any, int]]:
+    """Each number, word or other value in lists however nested, and how deep it is."""
+    if not isinstance(value, list):
+        yield value, depth
+    else:
+        for item in value:
+            yield from _leaves(item, depth + 1)
+
+
+def in_words(forms: set[tuple[type, int]], words: list[str]) -> str:
+    """Kinds of numbers and depths of lists in words, with the words that a string must be one of."""
+    alone = ONE | ({str: " or ".join(map(repr, words))} if words else {})
+    whole = {(int, depth) for kind, depth in forms if kind is float}  # a number may be whole anyway
+    lists = sorted(forms - whole, key=lambda form: (form[1], form[0] is str))
+    return " or ".join(f"a list of {'lists of ' * (k - 1)}{_MANY[kind]}" if k else alone[kind] for kind, k in lists)
+
+
+def fits(leaf: Any, kind: type) -> bool:
+    """Whether a number, word or switch is of a kind."""
+    if isinstance(leaf, bool) or kind in (bool, str):
+        return type(leaf) is kind
+    return isinstance(leaf, (int, float)) if kind is float else isinstance(leaf, int) and abs(leaf) < 2**63
+
+
 def _bounds(schema: dict[str, Any]) -> dict[str, float | int]:
     """The bounds of the numbers that a schema takes, in lists however nested."""
     inner = [*schema.get("anyOf", ()), *([schema["items"]] if "items" in schema else ())]
@@ -109,9 +157,7 @@ def _bounds(schema: dict[str, Any]) -> dict[str, float | int]:
 
 def _numbers(value: Any) -> list[float | int]:
     """The finite numbers in a value, in lists however nested."""
-    if isinstance(value, list):
-        return [number for item in value for number in _numbers(item)]
-    return [value] if type(value) in (int, float) and abs(value) < math.inf else []
+    return [leaf for leaf, _ in _leaves(value) if type(leaf) in (int, float) and abs(leaf) < math.inf]
 
 
 def within(numbers: Any, bounds: dict[str, float | int]) -> Any:

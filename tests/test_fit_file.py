@@ -299,7 +299,7 @@ FAULTS = {
     "kind": ('kind = "Tracks"', 'kind = "Traces"', r"kind must be one of"),
     "unknown key": ("report =", "reports =", r"unknown key"),
     "late": ("t1 = 0.048", "t1 = 0.9", r"must not lie after"),
-    "no end": ("t1 = 0.048", "t1 = {}", r"t1 must be a number, got \{\}"),
+    "no end": ("t1 = 0.048", "t1 = {}", r"t1\]? must be a number, got \{\}"),
     "many ends": ("t1 = 0.048", "t1 = [0.01, 0.02]", r"t1 must be a number, got \[0.01"),
     "a date": ("t1 = 0.048", "t1 = 2026-01-01", r"t1 must be a number, got datetime.date"),
     "bounds": ('unit = "Pa"', 'unit = "Pa"\nlower = 1.0', r"go with kind"),

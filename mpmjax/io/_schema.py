@@ -26,7 +26,18 @@ import numpy as np
 from jaxtyping import AbstractArray
 
 import mpmjax.extensions  # noqa: F401  # whose classes files hold as others
-from mpmjax._tables import are_named, kind_in, place_in_list, place_of, require_in, require_keys, short
+from mpmjax._tables import (
+    ONE,
+    are_named,
+    fits,
+    in_words,
+    kind_in,
+    place_in_list,
+    place_of,
+    require_in,
+    require_keys,
+    short,
+)
 from mpmjax._types import MAY_BE_INFINITE, Scalar
 from mpmjax.checks import alternatives, choices, is_abstract, is_class, is_own, marks_of, require
 from mpmjax.geometry import SampledDistance, sample_mesh
@@ -158,8 +169,6 @@ def _is_callable(hint: Any) -> bool:
 
 _SMALL = 64  # most numbers that are written out, and that are read as a tuple where both are taken
 _MOST_AXES = 3  # of what is annotated as an array and nothing more
-_ONE = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
-_MANY = {float: "numbers", int: "whole numbers", bool: "true and false", str: "strings"}
 
 
 def encode(value: Any, arrays: dict[str, np.ndarray] | None = None, path: str = "") -> Any:
@@ -304,7 +313,7 @@ def arguments(
 def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray] | None) -> Any:
     """Numbers, words and switches, single or in (nested) lists."""
     forms, words = forms_of(expected), words_of(expected)
-    must_be = f"must be {_in_words(forms, words)}, got"
+    must_be = f"must be {in_words(forms, words)}, got"
     if isinstance(data, dict) and set(data) == {"array"} and arrays is not None:
         require_in(where, data["array"] in arrays, f"refers to the array {data['array']!r}, which is not there")
         a = arrays[data["array"]]
@@ -312,7 +321,7 @@ def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray]
         kinds = {float}
     else:
         a = np.array(data, dtype=object)  # where lists are ragged, an array of lists
-        kinds = {kind for kind, depth in forms if depth == a.ndim and all(_fits(leaf, kind) for leaf in a.flat)}
+        kinds = {kind for kind, depth in forms if depth == a.ndim and all(fits(leaf, kind) for leaf in a.flat)}
         require_in(where, kinds - {str} if words and data not in words else kinds, f"{must_be} {short(data)}")
     if float in kinds:
         try:
@@ -359,7 +368,7 @@ def forms_of(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
     if not within and any(a in (jax.Array, np.ndarray) for a in alternatives(hint)):
         forms |= {(float, depth) for depth in range(_MOST_AXES + 1)}
     for a in alternatives(hint):
-        if a in _ONE:
+        if a in ONE:
             forms.add((a, 0))
         elif get_origin(a) is Literal:
             forms.add((str, 0))
@@ -374,16 +383,3 @@ def forms_of(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
 def words_of(hint: Any) -> list[str]:
     """The words that an annotation takes, if it takes some only."""
     return [word for a in alternatives(hint) if get_origin(a) is Literal for word in get_args(a)]
-
-
-def _in_words(forms: set[tuple[type, int]], words: list[str]) -> str:
-    alone = _ONE | ({str: " or ".join(map(repr, words))} if words else {})
-    whole = {(int, depth) for kind, depth in forms if kind is float}  # a number may be whole anyway
-    lists = sorted(forms - whole, key=lambda form: (form[1], form[0] is str))
-    return " or ".join(f"a list of {'lists of ' * (k - 1)}{_MANY[kind]}" if k else alone[kind] for kind, k in lists)
-
-
-def _fits(leaf: Any, kind: type) -> bool:
-    if isinstance(leaf, bool) or kind in (bool, str):
-        return type(leaf) is kind
-    return isinstance(leaf, (int, float)) if kind is float else isinstance(leaf, int) and abs(leaf) < 2**63
