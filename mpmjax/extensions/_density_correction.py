@@ -34,9 +34,9 @@ class DensityCorrection(AbstractCorrection):
         scene = mpm.Scene(..., mpm.Fluid(2e5), correction=mpm.extensions.DensityCorrection(vessel))
 
     *When it breaks*: material that parts gains the energy of the pressure that parts it. Beside walls that `room` does
-    not name, layers may hold nearly twice what fits. A fluid that is no `Fluid` and stores F is not corrected.
+    not name, layers may hold 1.7 times what fits. A fluid that is no `Fluid` and stores F is not corrected.
 
-    *Good values*: the defaults: a dam that breaks keeps its level within 4 %, where with two particles along a cell it
+    *Good values*: the defaults: a dam that breaks keeps its level within 3 %, where with two particles along a cell it
     loses 20 %, and half of it at five times the explicit limit (`python benchmarks/audit.py --only splash`).
 
     Args:

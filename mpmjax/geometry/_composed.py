@@ -67,6 +67,7 @@ class Union(AbstractComposed):
         return _extreme(jnp.less, self.regions, x)
 
     def joined(self, behind: Float[Array, "m k"]) -> Float[Array, "m"]:
+        # exact where they touch and where they overlap inside; too large where an overlap meets a side
         return jnp.minimum(self._each(behind).sum(axis=0), 1)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
