@@ -19,9 +19,8 @@ from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, Parti
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, carried_by_motion
 from mpmjax.boundary._conditions import Conditions, Slide, no_conditions, prescribed
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._flow_contact import FlowContact
 from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
-from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
+from mpmjax.boundary._surface_contact import Faces, FlowContact, Surface, refuse_contact, surface_contact
 from mpmjax.checks import between, canonical, require, require_fields
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, Motion, length, still
