@@ -5,7 +5,6 @@ from functools import reduce
 from itertools import chain
 from typing import Annotated, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,8 +22,8 @@ from mpmjax.geometry import Motion
 class AbstractBox(AbstractBoundary):
     """Walls around a box."""
 
-    lower: eqx.AbstractVar[Corner]  # position of the lower wall in each direction [m], (d,); −inf for none
-    upper: eqx.AbstractVar[Corner]  # position of the upper wall in each direction [m], (d,); inf for none
+    lower: Corner  # position of the lower wall in each direction [m], (d,); −inf for none
+    upper: Corner  # position of the upper wall in each direction [m], (d,); inf for none
 
     def __check_init__(self):
         require_fields(self)
@@ -88,7 +87,7 @@ class AbstractHoldingBox(AbstractBox):
     """Walls from which material cannot part. They hold the nodes at and behind them, and what flows by columns of nodes
     (see `wall_image`), so that it stays at rest."""
 
-    motion: eqx.AbstractVar[Motion | None]  # how the walls move together; None for not at all
+    motion: Motion | None = None  # how the walls move together; None for not at all
     holds_fluids: ClassVar[bool] = True
 
     def __check_init__(self):
@@ -134,9 +133,6 @@ class StickyBox(AbstractHoldingBox):
         motion: how the walls move together, in any direction. Default: not at all.
     """
 
-    lower: Corner
-    upper: Corner
-    motion: Motion | None = None
     sticks: ClassVar[bool] = True
 
 
@@ -155,10 +151,6 @@ class SlipBox(AbstractHoldingBox):
         upper: position of the upper wall in each direction [m], (d,); inf for none.
         motion: how the walls move together; of it the component along each wall's normal counts. Default: not at all.
     """
-
-    lower: Corner
-    upper: Corner
-    motion: Motion | None = None
 
 
 class SeparatingBox(AbstractBox):
@@ -183,8 +175,6 @@ class SeparatingBox(AbstractBox):
         friction: Coulomb coefficient [-], at least 0.
     """
 
-    lower: Corner
-    upper: Corner
     friction: Annotated[Scalar, between(0, 1e6)] = 0.0
     pushes: ClassVar[bool] = True
 

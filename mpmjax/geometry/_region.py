@@ -185,7 +185,7 @@ def _extreme(choose: Callable[[Array, Array], Array], regions: Regions, x: Float
 class AbstractComposed(AbstractRegion):
     """A region made of several."""
 
-    regions: eqx.AbstractVar[Regions]
+    regions: Regions = eqx.field(converter=_several)
 
     def __check_init__(self):
         require_fields(self)
@@ -218,8 +218,6 @@ class Union(AbstractComposed):
         regions: the regions.
     """
 
-    regions: Regions = eqx.field(converter=_several)
-
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         return _extreme(jnp.less, self.regions, x)
 
@@ -243,8 +241,6 @@ class Intersection(AbstractComposed):
     Args:
         regions: the regions.
     """
-
-    regions: Regions = eqx.field(converter=_several)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         return _extreme(jnp.greater, self.regions, x)

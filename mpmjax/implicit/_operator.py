@@ -1,4 +1,4 @@
-"""The matrix of implicit solves, M + χH on free components, and its preconditioners; the interface of linear solvers and
+"""The matrix of implicit solves, M + χH on free components, and its preconditioners; the interface of solvers and
 the report of a solve."""
 
 import abc
