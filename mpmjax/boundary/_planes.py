@@ -26,7 +26,7 @@ class AbstractPlane(AbstractBoundary):
 
     axis: int = eqx.field(static=True)  # direction of the normal, 0 to d − 1
     position: Scalar  # coordinate of the plane [m]
-    keep: str = eqx.field(static=True, default="above")  # which side holds the material: "above" or "below" the plane
+    keep: eqx.AbstractVar[str]  # which side holds the material: "above" or "below" the plane
     motion: eqx.AbstractVar[Any]  # how it moves; None for not at all
     plain_box: ClassVar[str]  # the box that is the same wall anywhere, to first order
 
@@ -109,6 +109,7 @@ class SymmetryPlane(AbstractPlane):
         motion: how it moves; of its displacement the component along the normal counts. Default: not at all.
     """
 
+    keep: str = eqx.field(static=True, default="above")
     motion: Motion | None = None
     plain_box: ClassVar[str] = "SlipBox"
 
@@ -154,6 +155,7 @@ class ClampPlane(AbstractPlane):
         motion: how it moves: a `Motion`, or a `RigidMotion`, which turns too. Default: not at all.
     """
 
+    keep: str = eqx.field(static=True, default="above")
     motion: Motion | AbstractMotion | None = None
     plain_box: ClassVar[str] = "Grip"
     meets_constraints: ClassVar[bool] = False
@@ -223,6 +225,7 @@ class ContactPlane(AbstractPlane):
         friction: Coulomb coefficient [-], at least 0.
     """
 
+    keep: str = eqx.field(static=True, default="above")
     friction: Annotated[Scalar, between(0, 1e6)] = 0.0
     motion: ClassVar[None] = None  # pyright: ignore[reportIncompatibleVariableOverride]
     plain_box: ClassVar[str] = "SeparatingBox"

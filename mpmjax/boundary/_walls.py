@@ -14,9 +14,9 @@ from mpmjax.boundary._conditions import Conditions, no_conditions, prescribed
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
 from mpmjax.boundary._surface_contact import SIGNS, Faces, Surface, refuse_contact, surface_contact
-from mpmjax.checks import between, coordinates, require, require_fields, require_that
+from mpmjax.checks import between, require, require_fields
 from mpmjax.discretisation import Grid, scatter
-from mpmjax.geometry import Motion
+from mpmjax.geometry import Motion, check_corners
 
 
 class AbstractBox(AbstractBoundary):
@@ -27,17 +27,7 @@ class AbstractBox(AbstractBoundary):
 
     def __check_init__(self):
         require_fields(self)
-        name = type(self).__name__
-        require(
-            coordinates(f"{name}'s lower corner", self.lower) == coordinates(f"{name}'s upper corner", self.upper),
-            f"{name} needs two corners with as many coordinates, got {self.lower} and {self.upper}.",
-        )
-        require_that(
-            f"{name}'s lower corner must lie below its upper one in each direction (infinite means no wall)",
-            lambda a, b: a < b,  # false of what is not a number
-            self.lower,
-            self.upper,
-        )
+        check_corners(type(self).__name__, self.lower, self.upper, " (infinite means no wall)")
 
     @property
     def dim(self) -> int:

@@ -24,6 +24,7 @@ from mpmjax.geometry._region import (
     Placed as Placed,
     Union as Union,
     box_cells as box_cells,
+    check_corners as check_corners,
     length as length,
 )
 from mpmjax.geometry._rigid_body import (

@@ -9,7 +9,7 @@ mean. It is never NaN or zero, so that a collider acts on what is at its middle 
 import abc
 from collections.abc import Callable
 from functools import reduce
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -94,6 +94,16 @@ def box_cells(lower: np.ndarray, upper: np.ndarray, size: np.ndarray) -> Cells:
     return centres, np.full(len(centres), np.prod(cell))
 
 
+def check_corners(name: str, lower: Any, upper: Any, hint: str = "") -> None:
+    """Check that two corners of a box have as many coordinates, the lower one's below the upper one's."""
+    require(
+        coordinates(f"{name}'s lower corner", lower) == coordinates(f"{name}'s upper corner", upper),
+        f"{name} needs two corners with as many coordinates, got {lower} and {upper}.",
+    )
+    below = f"{name}'s lower corner must lie below its upper one in each direction{hint}"
+    require_that(below, lambda a, b: a < b, lower, upper)  # false of what is not a number
+
+
 class Box(AbstractRegion):
     """The axis-aligned box between two corners.
 
@@ -108,12 +118,7 @@ class Box(AbstractRegion):
 
     def __check_init__(self):
         require_fields(self)
-        require(
-            coordinates("A box's lower corner", self.lower) == coordinates("A box's upper corner", self.upper),
-            f"A box needs two corners with as many coordinates, got {self.lower} and {self.upper}.",
-        )
-        below = "A box's lower corner must lie below its upper one in each direction"
-        require_that(below, lambda a, b: a < b, self.lower, self.upper)
+        check_corners("A box", self.lower, self.upper)
 
     @property
     def dim(self) -> int:

@@ -98,6 +98,7 @@ class AbstractRound(AbstractRegion):
     end: Annotated[Point, finite, "m"]
 
     def __check_init__(self):
+        require_fields(self)
         name, start, end = f"A {type(self).__name__.lower()}", self.start, self.end
         require(
             coordinates(f"{name}'s start", start) == coordinates(f"{name}'s end", end),
@@ -123,9 +124,6 @@ class Capsule(AbstractRound):
     """
 
     radius: Annotated[Scalar, positive, "m"]
-
-    def __check_init__(self):
-        require_fields(self)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """‖x − nearest point of the segment‖ − radius."""
