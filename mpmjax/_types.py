@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array as Array, Bool as Bool, Float as Float, Int as Int
 from typing_extensions import TypeAliasType
 
 if TYPE_CHECKING:  # a static checker need not follow NumPy arrays into JAX expressions, which take them
@@ -64,30 +64,6 @@ J, shape (*p)."""
 Compliance = Float[Array, "s s *p"]  # the map from the vector of a skew d x d matrix to a spin: s = 3 in 3-D, else 1
 
 Indices = Int[Array, "k p"]
-
-__all__ = [
-    "MAY_BE_INFINITE",
-    "Array",
-    "Bool",
-    "Compliance",
-    "Corner",
-    "Deformation",
-    "Float",
-    "Indices",
-    "Int",
-    "Mask",
-    "Matrix",
-    "NodeScalar",
-    "NodeVector",
-    "ParticleMatrix",
-    "ParticleScalar",
-    "ParticleVector",
-    "PerParticle",
-    "Point",
-    "Scalar",
-    "components",
-    "particle_first",
-]
 
 
 def components(a: Array) -> Array:

@@ -15,9 +15,8 @@ from scipy.stats import t as student
 from test_fit import DT, NOISE, RATIO, experiment, tracks
 
 import mpmjax as mpm
-from mpmjax.fitting._discretisation import CoarseGrid, look_at_coarse_grid, unexplained
 from mpmjax.fitting._estimate import improbable, shape_of, strongest_mode
-from mpmjax.fitting._evaluation import Evaluation
+from mpmjax.fitting._evaluation import CoarseGrid, Evaluation, look_at_coarse_grid, unexplained
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._result import Minimum, _judged, fit_result
 from mpmjax.fitting._search import Search

@@ -12,7 +12,7 @@ from helpers import assert_close, slow, thorough
 
 import mpmjax as mpm
 from mpmjax.boundary._contact import ConstrainedNodes
-from mpmjax.boundary._flow_contact import FlowContact
+from mpmjax.boundary._surface_contact import FlowContact
 from mpmjax.implicit import Projection
 from mpmjax.potential import Mirror, surface_image, with_one_mass
 

@@ -15,7 +15,7 @@ from numpy_oracle import grid_update, stress
 import mpmjax as mpm
 from mpmjax._types import Array
 from mpmjax.implicit import ImplicitOperator, Projection, SolveInfo, StageProblem, no_solve, solve
-from mpmjax.implicit._newton import MOST_HALVINGS, backtrack
+from mpmjax.implicit._stage import MOST_HALVINGS, backtrack
 
 TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 NEWTON = mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-12))

@@ -13,6 +13,7 @@ import mpmjax as mpm
 import mpmjax.viz._render
 from mpmjax.simulation._run import no_steps
 from mpmjax.state._particles import State
+from mpmjax.viz._picture import gaps, outward, skin
 from mpmjax.viz._render import (
     _bearing,
     _flat_canvas,
@@ -21,7 +22,6 @@ from mpmjax.viz._render import (
     _tinted,
     _upright,
 )
-from mpmjax.viz._surface import gaps, outward, skin
 
 
 def still_run(x, *, volume=1e-3, v=None, **scene) -> mpm.Run:

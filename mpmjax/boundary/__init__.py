@@ -20,7 +20,16 @@ from mpmjax.boundary._collider import (
     SlipCollider as SlipCollider,
     StickyCollider as StickyCollider,
 )
-from mpmjax.boundary._conditions import Conditions as Conditions, FreeNormal as FreeNormal, OwnedImpulse as OwnedImpulse
+from mpmjax.boundary._conditions import (
+    Conditions as Conditions,
+    FreeNormal as FreeNormal,
+    Impulses as Impulses,
+    OwnedCouple as OwnedCouple,
+    OwnedImpulse as OwnedImpulse,
+    no_impulses as no_impulses,
+    received_impulses as received_impulses,
+    taken_by_mirrors as taken_by_mirrors,
+)
 from mpmjax.boundary._contact import (
     AbstractContact as AbstractContact,
     AbstractSpringContact as AbstractSpringContact,
@@ -31,13 +40,6 @@ from mpmjax.boundary._contact import (
     count_places as count_places,
     friction_change as friction_change,
     friction_share as friction_share,
-)
-from mpmjax.boundary._impulses import (
-    Impulses as Impulses,
-    OwnedCouple as OwnedCouple,
-    no_impulses as no_impulses,
-    received_impulses as received_impulses,
-    taken_by_mirrors as taken_by_mirrors,
 )
 from mpmjax.boundary._plane_contact import with_tied_columns as with_tied_columns
 from mpmjax.boundary._planes import (

@@ -10,7 +10,6 @@ bodies share a node, the rules of `combined_conditions` apply.
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,9 +18,8 @@ from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, Parti
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, carried_by_motion
 from mpmjax.boundary._conditions import Conditions, Slide, no_conditions, prescribed
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._flow_contact import FlowContact
 from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
-from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
+from mpmjax.boundary._surface_contact import Faces, FlowContact, Surface, refuse_contact, surface_contact
 from mpmjax.checks import between, canonical, require, require_fields
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, Motion, length, still
@@ -35,10 +33,8 @@ _LOOKS = 4  # places of a particle's way in which a collider is looked for
 class AbstractCollider(AbstractBoundary):
     """A rigid body in the way of the material."""
 
-    shape: eqx.AbstractVar[AbstractRegion]
-    """The body before its motion."""
-    motion: eqx.AbstractVar[AbstractMotion | None]
-    """How it moves; None for not at all."""
+    shape: AbstractRegion  # the body before its motion
+    motion: Motion | AbstractMotion | None = None  # how it moves; None for not at all
     is_collider: ClassVar[bool] = True
 
     def __check_init__(self):
@@ -172,8 +168,6 @@ class StickyCollider(AbstractHoldingCollider):
         motion: how it moves. Default: not at all.
     """
 
-    shape: AbstractRegion
-    motion: Motion | AbstractMotion | None = None
     sticks: ClassVar[bool] = True
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
@@ -195,9 +189,6 @@ class SlipCollider(AbstractHoldingCollider):
         shape: the body before its motion.
         motion: how it moves. Default: not at all.
     """
-
-    shape: AbstractRegion
-    motion: Motion | AbstractMotion | None = None
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """In the total description its normal must be the same everywhere and always."""
@@ -240,8 +231,6 @@ class SeparatingCollider(AbstractCollider):
         friction: Coulomb coefficient [-], at least 0.
     """
 
-    shape: AbstractRegion
-    motion: Motion | AbstractMotion | None = None
     friction: Annotated[Scalar, between(0, 1e6)] = 0.0
     pushes: ClassVar[bool] = True
 

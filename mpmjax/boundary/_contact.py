@@ -32,14 +32,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._conditions import PARALLEL, OwnedImpulse
-from mpmjax.potential import (
-    AbstractSpring,
-    AbstractTerm,
-    Displacement,
-    Mirror,
-    scattered,
-    with_one_mass,
-)
+from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Mirror, scattered, with_one_mass
 
 ActiveSet = tuple[Bool[Array, "..."], ...]  # the places that are held, one mask for each contact
 

@@ -24,8 +24,8 @@ FAR = 0.1  # how far behind a contact plane a face is held whatever is beside it
 class AbstractPlane(AbstractBoundary):
     """A plane beyond which nodes are mirror images."""
 
-    axis: eqx.AbstractVar[int]  # direction of the normal, 0 to d − 1
-    position: eqx.AbstractVar[Scalar]  # coordinate of the plane [m]
+    axis: int = eqx.field(static=True)  # direction of the normal, 0 to d − 1
+    position: Scalar  # coordinate of the plane [m]
     keep: eqx.AbstractVar[str]  # which side holds the material: "above" or "below" the plane
     motion: eqx.AbstractVar[Any]  # how it moves; None for not at all
     plain_box: ClassVar[str]  # the box that is the same wall anywhere, to first order
@@ -109,8 +109,6 @@ class SymmetryPlane(AbstractPlane):
         motion: how it moves; of its displacement the component along the normal counts. Default: not at all.
     """
 
-    axis: int = eqx.field(static=True)
-    position: Scalar
     keep: str = eqx.field(static=True, default="above")
     motion: Motion | None = None
     plain_box: ClassVar[str] = "SlipBox"
@@ -157,8 +155,6 @@ class ClampPlane(AbstractPlane):
         motion: how it moves: a `Motion`, or a `RigidMotion`, which turns too. Default: not at all.
     """
 
-    axis: int = eqx.field(static=True)
-    position: Scalar
     keep: str = eqx.field(static=True, default="above")
     motion: Motion | AbstractMotion | None = None
     plain_box: ClassVar[str] = "Grip"
@@ -229,8 +225,6 @@ class ContactPlane(AbstractPlane):
         friction: Coulomb coefficient [-], at least 0.
     """
 
-    axis: int = eqx.field(static=True)
-    position: Scalar
     keep: str = eqx.field(static=True, default="above")
     friction: Annotated[Scalar, between(0, 1e6)] = 0.0
     motion: ClassVar[None] = None  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -5,7 +5,6 @@ from functools import reduce
 from itertools import chain
 from typing import Annotated, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,30 +14,20 @@ from mpmjax.boundary._conditions import Conditions, no_conditions, prescribed
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._plane_contact import SHUT, FlatWall, plane_contact, wall_images
 from mpmjax.boundary._surface_contact import SIGNS, Faces, Surface, refuse_contact, surface_contact
-from mpmjax.checks import between, coordinates, require, require_fields, require_that
+from mpmjax.checks import between, require, require_fields
 from mpmjax.discretisation import Grid, scatter
-from mpmjax.geometry import Motion
+from mpmjax.geometry import Motion, check_corners
 
 
 class AbstractBox(AbstractBoundary):
     """Walls around a box."""
 
-    lower: eqx.AbstractVar[Corner]  # position of the lower wall in each direction [m], (d,); −inf for none
-    upper: eqx.AbstractVar[Corner]  # position of the upper wall in each direction [m], (d,); inf for none
+    lower: Corner  # position of the lower wall in each direction [m], (d,); −inf for none
+    upper: Corner  # position of the upper wall in each direction [m], (d,); inf for none
 
     def __check_init__(self):
         require_fields(self)
-        name = type(self).__name__
-        require(
-            coordinates(f"{name}'s lower corner", self.lower) == coordinates(f"{name}'s upper corner", self.upper),
-            f"{name} needs two corners with as many coordinates, got {self.lower} and {self.upper}.",
-        )
-        require_that(
-            f"{name}'s lower corner must lie below its upper one in each direction (infinite means no wall)",
-            lambda a, b: a < b,  # false of what is not a number
-            self.lower,
-            self.upper,
-        )
+        check_corners(type(self).__name__, self.lower, self.upper, " (infinite means no wall)")
 
     @property
     def dim(self) -> int:
@@ -88,7 +77,7 @@ class AbstractHoldingBox(AbstractBox):
     """Walls from which material cannot part. They hold the nodes at and behind them, and what flows by columns of nodes
     (see `wall_image`), so that it stays at rest."""
 
-    motion: eqx.AbstractVar[Motion | None]  # how the walls move together; None for not at all
+    motion: Motion | None = None  # how the walls move together; None for not at all
     holds_fluids: ClassVar[bool] = True
 
     def __check_init__(self):
@@ -134,9 +123,6 @@ class StickyBox(AbstractHoldingBox):
         motion: how the walls move together, in any direction. Default: not at all.
     """
 
-    lower: Corner
-    upper: Corner
-    motion: Motion | None = None
     sticks: ClassVar[bool] = True
 
 
@@ -155,10 +141,6 @@ class SlipBox(AbstractHoldingBox):
         upper: position of the upper wall in each direction [m], (d,); inf for none.
         motion: how the walls move together; of it the component along each wall's normal counts. Default: not at all.
     """
-
-    lower: Corner
-    upper: Corner
-    motion: Motion | None = None
 
 
 class SeparatingBox(AbstractBox):
@@ -183,8 +165,6 @@ class SeparatingBox(AbstractBox):
         friction: Coulomb coefficient [-], at least 0.
     """
 
-    lower: Corner
-    upper: Corner
     friction: Annotated[Scalar, between(0, 1e6)] = 0.0
     pushes: ClassVar[bool] = True
 

@@ -15,17 +15,7 @@ import numpy as np
 from mpmjax._tables import scene_table
 from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
-from mpmjax.checks import (
-    canonical,
-    checked,
-    marks_of,
-    positive,
-    require,
-    require_marks,
-    shortened,
-    warn,
-    whole,
-)
+from mpmjax.checks import canonical, checked, marks_of, positive, require, require_marks, shortened, warn, whole
 from mpmjax.geometry import AbstractRegion
 from mpmjax.io import are_registered, arguments, check_fields, decode, load, parameters_of, save
 from mpmjax.simulation import number_of_steps

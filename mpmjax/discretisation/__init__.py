@@ -1,6 +1,5 @@
 """Grid, B-spline kernels, stencils, and the transfers between particles and grid."""
 
-from mpmjax.discretisation._axisymmetry import in_section as in_section, in_space as in_space
 from mpmjax.discretisation._fused_sums import (
     average as average,
     resist as resist,
@@ -20,6 +19,8 @@ from mpmjax.discretisation._stencil import (
     Stencil as Stencil,
     basis_of as basis_of,
     first_nodes as first_nodes,
+    in_section as in_section,
+    in_space as in_space,
     in_window as in_window,
     make_stencil as make_stencil,
 )

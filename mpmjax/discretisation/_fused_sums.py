@@ -16,9 +16,8 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.autodiff import custom_derivative, saved_for_backward
-from mpmjax.discretisation._axisymmetry import in_section, in_space
 from mpmjax.discretisation._native_sums import basis_attributes, call_average
-from mpmjax.discretisation._stencil import Basis, Stencil
+from mpmjax.discretisation._stencil import Basis, Stencil, in_section, in_space
 from mpmjax.discretisation._sums import Group, gather, gather_sum, given_rows, scatter, scatter_change, scatter_sum
 
 

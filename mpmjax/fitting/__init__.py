@@ -21,9 +21,14 @@ from mpmjax.fitting._experiment import (
 )
 from mpmjax.fitting._fit import EnsembleFit as EnsembleFit, fit as fit, fit_ensemble as fit_ensemble
 from mpmjax.fitting._observation import (
+    CentreOfMass as CentreOfMass,
     Curve as Curve,
+    Density as Density,
+    Extent as Extent,
     Force as Force,
+    Markers as Markers,
     Series as Series,
+    StressStretch as StressStretch,
     Torque as Torque,
     Tracks as Tracks,
 )
@@ -46,13 +51,6 @@ from mpmjax.fitting._prediction import (
 )
 from mpmjax.fitting._problem import FitProblem as FitProblem
 from mpmjax.fitting._profile import Profile as Profile, profile as profile
-from mpmjax.fitting._quantities import (
-    CentreOfMass as CentreOfMass,
-    Density as Density,
-    Extent as Extent,
-    Markers as Markers,
-    StressStretch as StressStretch,
-)
 from mpmjax.fitting._result import FitResult as FitResult
 from mpmjax.fitting._search import AbstractOptimiser as AbstractOptimiser
 from mpmjax.fitting._sequence import RefinedFit as RefinedFit, fit_refined as fit_refined, fit_staged as fit_staged

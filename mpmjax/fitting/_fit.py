@@ -15,9 +15,8 @@ import numpy as np
 
 from mpmjax._types import Scalar
 from mpmjax.checks import between, checked, require, shortened, warn, whole
-from mpmjax.fitting._discretisation import look_at_coarse_grid
 from mpmjax.fitting._estimate import table
-from mpmjax.fitting._evaluation import Evaluation
+from mpmjax.fitting._evaluation import Evaluation, look_at_coarse_grid
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._log import recorded
 from mpmjax.fitting._optimiser import LBFGS, LevenbergMarquardt
@@ -145,7 +144,21 @@ def fit(
 
 def _see(problem: FitProblem, seen: Evaluation, alike: set[str]) -> None:
     """Refuse parameters that the data do not see at the first guess; warn, once, of those not seen apart, `alike`."""
-    require_influence(problem, seen)
+    rounding = _ROUNDINGS * float(problem.rounding_of_data())
+    if seen.jacobian is None:
+        # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.
+        size = np.abs(np.asarray(seen.gradient)) / max(np.sqrt(2 * float(seen.cost)), np.finfo(float).tiny)
+        if (size <= rounding).any():
+            # Jᵀw with random numbers w of variance one: the expected square of a component is that of J's column.
+            size = np.abs(np.asarray(_random_pull(problem, jnp.zeros(problem.size, problem.dtype))))
+    else:
+        size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
+    unseen = [label for label, length in zip(problem.labels, size, strict=True) if length <= rounding]
+    require(
+        not unseen,
+        f"The data do not depend on {shortened(', '.join(unseen))}: their derivative by it is zero but for "
+        "rounding. Leave it out, give it a prior, or observe what it changes.",
+    )
     if seen.jacobian is None or alike:
         return
     errors = uncertainty(np.asarray(seen.jacobian, float), float(jnp.finfo(problem.dtype).eps), ())
@@ -211,25 +224,6 @@ def require_end(end: Search) -> None:
             "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a "
             "law or an observation cannot be differentiated where the run takes it."
         )
-
-
-def require_influence(problem: FitProblem, seen: Evaluation) -> None:
-    """Check that the data depend on every coordinate, at the first guess."""
-    rounding = _ROUNDINGS * float(problem.rounding_of_data())
-    if seen.jacobian is None:
-        # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.
-        size = np.abs(np.asarray(seen.gradient)) / max(np.sqrt(2 * float(seen.cost)), np.finfo(float).tiny)
-        if (size <= rounding).any():
-            # Jᵀw with random numbers w of variance one: the expected square of a component is that of J's column.
-            size = np.abs(np.asarray(_random_pull(problem, jnp.zeros(problem.size, problem.dtype))))
-    else:
-        size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
-    unseen = [label for label, length in zip(problem.labels, size, strict=True) if length <= rounding]
-    require(
-        not unseen,
-        f"The data do not depend on {shortened(', '.join(unseen))}: their derivative by it is zero but for "
-        "rounding. Leave it out, give it a prior, or observe what it changes.",
-    )
 
 
 @eqx.filter_jit

@@ -259,9 +259,17 @@ class LBFGS(AbstractOptimiser):
             usable = jnp.isfinite(cost) & jnp.isfinite(gradient).all()
             return jnp.where(usable, cost, jnp.inf), jnp.where(usable, gradient, 0)
 
+        @jax.custom_jvp  # by which value and derivative are evaluated together, once
+        def value(z: Coordinates) -> Array:
+            return evaluate(z)[0]
+
+        @value.defjvp
+        def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+            at, derivative = evaluate(primals[0])
+            return at, derivative @ tangents[0]
+
         line: Any = optax.scale_by_zoom_linesearch(self.line_search, approx_dec_rtol=slack / jnp.maximum(cost, slack))
-        value_fn = evaluated_once(evaluate)
-        step, at_end = line.update(-along, line.init(z), z, value=cost, grad=gradient, value_fn=value_fn)
+        step, at_end = line.update(-along, line.init(z), z, value=cost, grad=gradient, value_fn=value)
         moved = (at_end.learning_rate > 0) & (at_end.value <= cost + slack)
         points = sum((jnp.isfinite(o.data).sum() for o in problem.observations), jnp.zeros((), int))
         freedom = jnp.maximum(points + problem.fixed_by_priors - problem.size, 1).astype(cost.dtype)
@@ -293,21 +301,6 @@ class LBFGSState(NamedTuple):
     decrease_tolerance: Float[Array, ""]  # decrease of the cost below which a line search is negligible
     small: Int[Array, ""]  # how many line searches in a row brought next to nothing
     stalled: Bool[Array, ""]  # whether nothing lower was found along the negative gradient
-
-
-def evaluated_once(evaluate: Callable[[Coordinates], tuple[Array, Array]]) -> Callable[[Coordinates], Array]:
-    """A function whose value and derivative are evaluated together, once."""
-
-    @jax.custom_jvp
-    def value(z: Coordinates) -> Array:
-        return evaluate(z)[0]
-
-    @value.defjvp
-    def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-        at, derivative = evaluate(primals[0])
-        return at, derivative @ tangents[0]
-
-    return value
 
 
 class Adam(AbstractOptimiser):

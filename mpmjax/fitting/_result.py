@@ -11,7 +11,6 @@ import numpy as np
 
 from mpmjax._types import Array
 from mpmjax.checks import require
-from mpmjax.fitting._discretisation import CoarseGrid, unexplained
 from mpmjax.fitting._estimate import (
     IMPROBABLE,
     VALUE,
@@ -23,6 +22,7 @@ from mpmjax.fitting._estimate import (
     strongest_mode,
     table,
 )
+from mpmjax.fitting._evaluation import CoarseGrid, unexplained
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem

@@ -9,11 +9,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Int, Scalar
+from mpmjax._types import Float, Int, Scalar
 from mpmjax.checks import between, require, require_fields, require_finite, whole
 from mpmjax.fitting._estimate import table
 from mpmjax.fitting._evaluation import costs_at
-from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import SHOWN, FitProblem
 from mpmjax.fitting._search import AbstractOptimiser, Search, batch_size, counted, search_many
 
@@ -277,12 +276,6 @@ def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], start
     return np.concatenate([np.zeros((1, problem.size)), np.concatenate(columns, axis=1)])
 
 
-@eqx.filter_jit
-def _coordinates(parameter: AbstractParameter, start: Array, values: np.ndarray | Array) -> Array:
-    """The coordinates of values, compiled."""
-    return parameter.coordinate(start, jnp.asarray(values, start.dtype))
-
-
 def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], fraction: Scalar) -> Int[np.ndarray, "k"]:
     """For each of some points of the unit cube, `shares`, the number of the one that stands for it by multi-level
     single linkage (see `Starts`): its own where a search starts there, as at the best fraction of all, and -1 where the
@@ -308,6 +301,7 @@ def critical_distance(count: int, size: int) -> float:
     return float(np.exp(logarithm / size) / np.sqrt(np.pi))
 
 
+_coordinates = eqx.filter_jit(lambda p, start, values: p.coordinate(start, jnp.asarray(values, start.dtype)))
 _AUTOMATIC = 24  # points that are looked at without being asked
 _SHOWN = 8  # how many minima a table shows
 _FAILS = "the simulation fails there, or does not reach the data"

@@ -1,12 +1,6 @@
 """Regions, distances sampled on a lattice, surfaces, prescribed motions and time series."""
 
 from mpmjax._types import Corner as Corner
-from mpmjax.geometry._composed import (
-    Complement as Complement,
-    Intersection as Intersection,
-    Placed as Placed,
-    Union as Union,
-)
 from mpmjax.geometry._cut_cells import Pieces as Pieces, inside_parts as inside_parts, surface_pieces as surface_pieces
 from mpmjax.geometry._motion import (
     AbstractMotion as AbstractMotion,
@@ -24,8 +18,13 @@ from mpmjax.geometry._motion import (
 from mpmjax.geometry._region import (
     AbstractRegion as AbstractRegion,
     Box as Box,
+    Complement as Complement,
     HalfSpace as HalfSpace,
+    Intersection as Intersection,
+    Placed as Placed,
+    Union as Union,
     box_cells as box_cells,
+    check_corners as check_corners,
     length as length,
 )
 from mpmjax.geometry._rigid_body import (

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,16 +22,15 @@ _ON_IT = 1e-9  # distance within which a point is on a surface, in spacings
 _ROUNDINGS = 8.0  # the least such distance, in roundings of the greatest coordinate
 
 
-def _batched(
-    function: Callable[[AbstractRegion, Array], tuple[Array, ...]], region: AbstractRegion, x: np.ndarray
-) -> list[np.ndarray]:
-    """The arrays that a compiled function of a region and of points [m], shape (m, d), gives, a row for each point."""
+def _batched(function: Callable[[AbstractRegion, Array], Any], region: AbstractRegion, x: np.ndarray) -> Any:
+    """The array, or several, that a compiled function of a region and of points [m], shape (m, d), gives, a row for
+    each point."""
     dtype = jnp.result_type(float)
     batches = np.zeros((max(1, -(-len(x) // _BATCH)), _BATCH, x.shape[1]), dtype)
     batches.reshape(-1, x.shape[1])[: len(x)] = x
     region = canonical(region, dtype)
     results = [function(region, jax.device_put(batch)) for batch in batches]
-    return [np.concatenate(parts).astype(float)[: len(x)] for parts in zip(*results, strict=True)]
+    return jax.tree.map(lambda *parts: np.concatenate(parts).astype(float)[: len(x)], *results)
 
 
 @eqx.filter_jit
@@ -43,20 +42,14 @@ def _distance_and_gradient(
 
 
 @eqx.filter_jit
-def _sides_of(region: AbstractRegion, x: Float[Array, "m d"]) -> tuple[Float[Array, "m k"]]:
-    return (region.sides(x),)
-
-
-@eqx.filter_jit
-def _joined(region: AbstractRegion, behind: Float[Array, "m k"]) -> tuple[Float[Array, "m"]]:
-    return (region.joined((behind > 0).astype(behind.dtype)),)
-
-
-@eqx.filter_jit
 def _sides_and_slopes(
     region: AbstractRegion, x: Float[Array, "m d"]
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k d"]]:
     return region.sides(x), jax.vmap(jax.jacfwd(lambda at: region.sides(at[None])[0]))(x)
+
+
+_sides = eqx.filter_jit(lambda region, x: region.sides(x))
+_joined = eqx.filter_jit(lambda region, behind: region.joined((behind > 0).astype(behind.dtype)))
 
 
 def inside_parts(region: AbstractRegion, centres: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,7 +182,7 @@ def surface_pieces(
     axes = [(low + np.arange(n)) * spacing for low, n in zip(start, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     near = max(_ON_IT * spacing, _ROUNDINGS * float(jnp.finfo(float).eps) * np.abs(points).max())
-    values = _sides(region, points.reshape(-1, d), near)
+    values = _rounded(_batched(_sides, region, points.reshape(-1, d)), near)
     of_sides = []
     for side in range(values.shape[1]):
         parts = [_cut(*corners) for corners in _simplices(points, values[:, side].reshape(counts))]
@@ -205,19 +198,8 @@ def _sized(pieces: Pieces, spacing: float) -> Pieces:
     return pieces._replace(normal=pieces.normal / np.sqrt((pieces.normal**2).sum(axis=1, keepdims=True)))
 
 
-def _sides(region: AbstractRegion, x: np.ndarray, near: float) -> np.ndarray:
-    """The region's `sides` at points x [m], shape (m, d), shape (m, k); zero where they are not more than `near`."""
-    (distance,) = _batched(_sides_of, region, x)
-    return _rounded(distance, near)
-
-
-def _holds(region: AbstractRegion, behind: np.ndarray) -> np.ndarray:
-    """Whether points lie in a region, shape (m,), by whether each is behind each of its `sides`, shape (m, k)."""
-    (joined,) = _batched(_joined, region, behind)
-    return joined > 0
-
-
 def _rounded(distance: np.ndarray, near: float) -> np.ndarray:
+    """Distances, zero where they are not more than `near`, and none without end."""
     return np.where(np.abs(distance) <= near, 0, np.clip(distance, -_FAR, _FAR))
 
 
@@ -287,10 +269,10 @@ def _bounding(pieces: Pieces, side: int, region: AbstractRegion, within: Abstrac
     behind, flat, alike = points[:, :, d:].mean(axis=1) <= 0, flat[piece], alike[piece]
     places = np.where(flat, alike, behind), np.where(flat, ~alike, behind)  # behind each piece, and before it
     k = each[0][0].shape[1]
-    here, there = (_holds(region, place[:, :k]) for place in places)
+    here, there = (_batched(_joined, region, place[:, :k]) > 0 for place in places)
     bounds, inner = here & ~there & ~(flat & alike)[:, :side].any(axis=1), np.ones(len(points), bool)
     if within is not None:
-        here, there = (_holds(within, place[:, k:]) for place in places)
+        here, there = (_batched(_joined, within, place[:, k:]) > 0 for place in places)
         bounds, inner = bounds & (here | there), here & there
     return Pieces(points[:, :, :d], area[piece], inner).of(bounds)
 

@@ -3,7 +3,6 @@
 import itertools
 from typing import Annotated
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -95,10 +94,11 @@ class Annulus(AbstractRegion):
 class AbstractRound(AbstractRegion):
     """A region about the segment between two points."""
 
-    start: eqx.AbstractVar[Point]
-    end: eqx.AbstractVar[Point]
+    start: Annotated[Point, finite, "m"]
+    end: Annotated[Point, finite, "m"]
 
     def __check_init__(self):
+        require_fields(self)
         name, start, end = f"A {type(self).__name__.lower()}", self.start, self.end
         require(
             coordinates(f"{name}'s start", start) == coordinates(f"{name}'s end", end),
@@ -123,12 +123,7 @@ class Capsule(AbstractRound):
         radius: radius [m].
     """
 
-    start: Annotated[Point, finite, "m"]
-    end: Annotated[Point, finite, "m"]
     radius: Annotated[Scalar, positive, "m"]
-
-    def __check_init__(self):
-        require_fields(self)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """‖x − nearest point of the segment‖ − radius."""
@@ -151,8 +146,6 @@ class Cylinder(AbstractRound):
         radius: radius [m].
     """
 
-    start: Annotated[Point, finite, "m"]
-    end: Annotated[Point, finite, "m"]
     radius: Annotated[Scalar, positive, "m"]
 
     def __check_init__(self):
@@ -195,8 +188,6 @@ class Tube(AbstractRound):
         outer: outer radius [m].
     """
 
-    start: Annotated[Point, finite, "m"]
-    end: Annotated[Point, finite, "m"]
     inner: Annotated[Scalar, positive, "m"]
     outer: Scalar
 

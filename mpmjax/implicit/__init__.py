@@ -4,15 +4,18 @@ Choices of a method: `ConjugateResidual`, `Linearised`, `Newton`; `AnalyticHessi
 `DiagonalPreconditioner`, `MassPreconditioner`; `Guess`. The bases to derive from are called `Abstract...`.
 """
 
-from mpmjax.implicit._newton import Newton as Newton
 from mpmjax.implicit._operator import (
     AbstractInnerProduct as AbstractInnerProduct,
+    AbstractInnerProductSolver as AbstractInnerProductSolver,
     AbstractPreconditioner as AbstractPreconditioner,
     DiagonalInnerProduct as DiagonalInnerProduct,
     DiagonalPreconditioner as DiagonalPreconditioner,
     ImplicitOperator as ImplicitOperator,
     MassPreconditioner as MassPreconditioner,
     Projection as Projection,
+    SolveInfo as SolveInfo,
+    no_solve as no_solve,
+    require_solver as require_solver,
 )
 from mpmjax.implicit._potential import (
     AbstractHessian as AbstractHessian,
@@ -23,17 +26,12 @@ from mpmjax.implicit._potential import (
     ParticleStiffness as ParticleStiffness,
     TangentAction as TangentAction,
 )
-from mpmjax.implicit._solve_info import (
-    AbstractInnerProductSolver as AbstractInnerProductSolver,
-    SolveInfo as SolveInfo,
-    no_solve as no_solve,
-    require_solver as require_solver,
-)
 from mpmjax.implicit._solver import ConjugateResidual as ConjugateResidual
 from mpmjax.implicit._stage import (
     AbstractStageSolver as AbstractStageSolver,
     Guess as Guess,
     Linearised as Linearised,
+    Newton as Newton,
     Reporting as Reporting,
     StageProblem as StageProblem,
     solve as solve,

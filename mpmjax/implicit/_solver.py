@@ -17,14 +17,15 @@ from mpmjax.checks import positive, require_fields, tolerance, whole
 from mpmjax.discretisation import Basis, basis_attributes, resist_sum, without_flat
 from mpmjax.implicit._operator import (
     AbstractInnerProduct,
+    AbstractInnerProductSolver,
     DiagonalInnerProduct,
     ImplicitOperator,
+    SolveInfo,
     active_blocks,
     combine_onto,
     rest_of_product,
 )
 from mpmjax.implicit._potential import ParticleStiffness
-from mpmjax.implicit._solve_info import AbstractInnerProductSolver, SolveInfo
 
 DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}  # the default relative tolerance, by bytes a number
 NEARLY_CONVERGED = 10.0

@@ -220,8 +220,7 @@ def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> 
 
 def _end_of(run: Run, like: State | None) -> State:
     """The state at the end, with masses if a state `like` it has them."""
-    masses = {} if like is None or like.mass is None else {"mass": run.final.mass, "volume": run.final.volume}
-    return replace(state_of(run.final), **masses)
+    return state_of(run.final, masses=like is not None and like.mass is not None)
 
 
 @checked

@@ -74,10 +74,7 @@ def initial_state(problem: "Problem") -> RolloutState:
     of = particles.dim, particles.x.dtype
     colliders = no_impulses(scene.collider_count, *of) if scene.collider_count else None
     boundaries = no_impulses(len(scene.boundary) + len(scene.guides), *of) if scene.boundary_forces else None
-    state = state_of(particles)
-    if problem.control is not None:
-        state = replace(state, mass=particles.mass, volume=particles.volume)
-    return RolloutState(state, colliders, boundaries, problem.memory)
+    return RolloutState(state_of(particles, masses=problem.control is not None), colliders, boundaries, problem.memory)
 
 
 Control = Callable[[Scene, Particles, Scalar, Scalar, Any], tuple[Scene, Particles, Any]]
@@ -132,8 +129,7 @@ class Problem(eqx.Module):
             "A control must return a scene with the boundaries, loads, laws and grid that it was given, and may change "
             "their numbers only.",
         )
-        state = replace(state_of(particles), mass=particles.mass, volume=particles.volume)
-        return replace(self, scene=scene), replace(y, particles=state, memory=memory)
+        return replace(self, scene=scene), replace(y, particles=state_of(particles, masses=True), memory=memory)
 
     def in_step(self, state: State) -> Particles:
         """The particles as a step takes them."""

@@ -66,6 +66,7 @@ class AbstractLoad(eqx.Module):
 class AbstractDeadLoad(AbstractLoad):
     """A force a weight of the points that keeps its direction. Linear, and so exact inside an implicit solve."""
 
+    on: AbstractPlace
     value: ClassVar[str]  # the field with the force, (d,), or a `TimeSeries` of it
     __check_init__ = require_fields
 
@@ -89,7 +90,6 @@ class Traction(AbstractDeadLoad):
         traction: force per undeformed area [N/m^(d−1)], (d,), or a `TimeSeries` of it.
     """
 
-    on: AbstractPlace
     traction: Annotated[ChangingVector, require_some, "N/m²"]
     value: ClassVar[str] = "traction"
 
@@ -106,7 +106,6 @@ class PointLoad(AbstractDeadLoad):
         total: the whole force [N], (d,), or a `TimeSeries` of it; in 2-D per metre of thickness.
     """
 
-    on: AbstractPlace
     total: Annotated[ChangingVector, require_some, "N"]
     value: ClassVar[str] = "total"
 

@@ -272,9 +272,10 @@ def with_dust(particles: Particles) -> Particles:
     return eqx.tree_at(lambda q: (q.mass, q.volume), particles, (some(particles.mass), some(particles.volume)))
 
 
-def state_of(particles: Particles) -> State:
-    """The evolving part of prepared particles."""
-    return State(particles.x, particles.v, particles.C, particles.deformations, particles.histories)
+def state_of(particles: Particles, *, masses: bool = False) -> State:
+    """The evolving part of prepared particles, with masses and volumes if a control may change them."""
+    changing = (particles.mass, particles.volume) if masses else ()
+    return State(particles.x, particles.v, particles.C, particles.deformations, particles.histories, *changing)
 
 
 def with_state(particles: Particles, state: State) -> Particles:

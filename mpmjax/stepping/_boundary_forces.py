@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Mask, NodeVector, Scalar
+from mpmjax._types import Array, NodeVector, Scalar
 from mpmjax.boundary import ConstrainedNodes, Impulses, OwnedImpulse, received_impulses, taken_by_mirrors
 from mpmjax.discretisation import Gathered
 from mpmjax.potential import Image, Mirror, SurfaceImage
@@ -140,20 +140,14 @@ def _of_what_holds(held: ConstrainedNodes, residual: NodeVector, owners: Array) 
     parts = list(held.along_normals(residual))
     of_walls, residual = taken_by_mirrors(held.without_collider_impulses(residual), held.walls)
     parts += [*of_walls, OwnedImpulse(residual, owners)]
-    taken = _taken_by_contacts(held, owners >= 0)
-    return parts + [OwnedImpulse(jnp.where(mine, residual, 0), number) for number, mine in taken]
-
-
-def _taken_by_contacts(held: ConstrainedNodes, taken: Mask) -> list[tuple[int, Mask]]:
-    """The components whose impulse is that of each contact, by its boundary's number: first what contacts fix, then all
-    of the nodes that surfaces reach. There masses that are one in all directions are not BᵀMB, and what differs,
-    without a sum along a plane, is the surface's."""
-    nodes, shape, parts = held.unconstrained, taken.shape, []
+    # of the other components what contacts fix is theirs, then all of the nodes that surfaces reach: there masses that
+    # are one in all directions are not BᵀMB, and what differs, without a sum along a plane, is the surface's
+    nodes, taken = held.unconstrained, owners >= 0
     contacts = zip(nodes.brought_by, nodes.contacts, held.active, strict=True)
-    masks = [(number, contact.fixed(active, shape)) for number, contact, active in contacts]
-    masks += [(number, wall.reached(shape)) for number, wall in held.walls if isinstance(wall, SurfaceImage)]
+    masks = [(number, contact.fixed(active, taken.shape)) for number, contact, active in contacts]
+    masks += [(number, wall.reached(taken.shape)) for number, wall in held.walls if isinstance(wall, SurfaceImage)]
     for number, mask in masks:
         if number is not None:
-            parts.append((number, mask & ~taken))
+            parts.append(OwnedImpulse(jnp.where(mask & ~taken, residual, 0), number))
             taken = taken | mask
     return parts

@@ -9,14 +9,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
-from mpmjax.boundary import (
-    AbstractContact,
-    Conditions,
-    FreeNormal,
-    combined_conditions,
-    mirror,
-    with_tied_columns,
-)
+from mpmjax.boundary import AbstractContact, Conditions, FreeNormal, combined_conditions, mirror, with_tied_columns
 from mpmjax.discretisation import Stencil, in_section, in_space, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.potential import AbstractTerm, Forces, Mirror, SurfaceImage, WallImage

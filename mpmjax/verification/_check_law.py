@@ -128,18 +128,12 @@ def _faults(law: AbstractMaterial, F: Matrix) -> tuple[Bool[Array, "p"], tuple[F
         compared(differential(law, F), A),
         0 * _size(third),
     )
-    if type(law).principal_differential is not base.principal_differential:
-        faults += (compared(_assembled(law, U, s, V), A),)
+    if type(law).principal_differential is not base.principal_differential:  # assembled at F = U diag(s) Vᵀ
+        tangent, modes = law.principal_differential(s), la.principal_modes(U, V).reshape(d * d, d * d, -1)
+        core = la.diagonal(jnp.concatenate([jnp.zeros_like(s), tangent.twist, tangent.flip]))
+        core = core.at[:d, :d].set(tangent.scaling)
+        faults += (compared(la.matmul(la.transpose(modes), la.matmul(core, modes)), A),)
     return law.is_admissible(F), faults
-
-
-def _assembled(law: AbstractMaterial, U: Matrix, s: Float[Array, "d p"], V: Matrix) -> Float[Array, "m m p"]:
-    """The stress differential at F = U diag(s) Vᵀ, assembled from `principal_differential`."""
-    d, tangent = len(s), law.principal_differential(s)
-    modes = la.principal_modes(U, V).reshape(d * d, d * d, -1)
-    core = la.diagonal(jnp.concatenate([jnp.zeros_like(s), tangent.twist, tangent.flip]))
-    core = core.at[:d, :d].set(tangent.scaling)
-    return la.matmul(la.transpose(modes), la.matmul(core, modes))
 
 
 def _size(A: Float[Array, "a b p"]) -> Float[Array, "p"]:

@@ -14,8 +14,7 @@ from mpmjax.checks import between, canonical, checked, require, require_memory
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene, history_arrays
-from mpmjax.viz._film import film_pictures, write_film
-from mpmjax.viz._surface import gaps, outward, skin
+from mpmjax.viz._picture import film_pictures, gaps, outward, skin, write_film
 
 COLOURS: dict[str, tuple[str, Callable[[Scene, Particles], Any]]] = {
     **{name: field for name, field in FIELDS.items() if name != "stress"},
