@@ -44,6 +44,7 @@ KEPT = tempfile.TemporaryDirectory()
 QUICK_TO_COMPILE = [
     "--xla_backend_optimization_level=0",
     "--xla_cpu_parallel_codegen_split_count=1",  # small programs: one module of LLVM
+    "--xla_disable_hlo_passes=while-loop-invariant-code-motion",  # a third of the time where loops hold contacts
 ]
 """Flags of XLA on CPUs with which a program compiles in a third of the time and runs slower."""
 if jax.__version_info__ < (0, 11):  # later ones end at a flag that they do not know

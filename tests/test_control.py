@@ -233,6 +233,7 @@ def with_absent(particles, every=3):
 
 
 GAS = mpm.Fluid(1e4, tension=True)
+FACES = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), friction=0.3)
 SCENES = {
     **{name: {"transfer": transfer} for name, transfer in TRANSFERS.items()},
     "linear": {"kernel": mpm.BSpline(1)},
@@ -240,8 +241,9 @@ SCENES = {
     "semi-implicit": {"method": mpm.SemiImplicit(1.0, mpm.implicit.ConjugateResidual(rtol=1e-13))},
     "backward Euler": {"method": mpm.BackwardEuler()},
     "fluid": {"material": GAS, "boundary": mpm.SeparatingBox((0.0, 0.0), (0.6, 0.6))},
-    "faces": {
-        "boundary": mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), friction=0.3),
+    "faces": {"boundary": FACES},
+    "faces, semi-implicit": {
+        "boundary": FACES,
         "method": mpm.SemiImplicit(1.0, mpm.implicit.ConjugateResidual(rtol=1e-13)),
     },
     "averaged": {"volume": mpm.AveragedVolume()},

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow, thorough
 from matplotlib import pyplot as plt
 from scipy.integrate import quad
 from scipy.optimize import least_squares, lsq_linear
@@ -390,13 +391,12 @@ def test_a_minimum_beyond_a_bound_is_found_at_it_with_a_one_sided_interval(name)
     assert beside > 0 or name != "lower"
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.5, 1.0, 2.3, 4.2])
 @pytest.mark.parametrize(
-    "name",
+    ("name", "offset"),
     [
-        pytest.param("lower", marks=pytest.mark.slow),
-        pytest.param("upper", marks=pytest.mark.slow),
-        pytest.param("zero", marks=pytest.mark.thorough),
+        *thorough(*(("zero", offset) for offset in (0.0, 1.0, 4.2))),
+        *slow(("zero", 0.5), ("zero", 2.3)),
+        *slow(*((name, offset) for name in ("lower", "upper") for offset in (0.0, 0.5, 1.0, 2.3, 4.2))),
     ],
 )
 def test_intervals_cover_a_truth_beside_its_bound(name, offset):

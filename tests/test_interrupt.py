@@ -165,7 +165,7 @@ def test_a_signal_ends_a_fit_with_the_best_so_far(begun, tmp_path):
     """Its table, picture and numbers are there; killed and resumed it ends with the numbers of the whole fit, to the
     last bit."""
     (tmp_path / "front.csv").write_text("t,x\n0.5,0.361\n1.0,0.334\n1.5,0.318\n2.0,0.326\n2.5,0.340\n")
-    scene = SCENE.replace("1e4\ndt", "2.5\ndt").replace("dt = 1e-3", "dt = 2e-4")
+    scene = SCENE.replace("1e4\ndt", "2.5\ndt").replace("dt = 1e-3", "dt = 4e-4")
     scene += FIT.replace("[fit]\n", "[fit]\ndiscretisation = false\n")
     finish(begun("fit", "scene.toml", "--plot", "whole.png", scene=scene))
 
