@@ -23,7 +23,9 @@ _HOMES = {
 
 def __getattr__(name: str):
     if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        rooms = () if name.startswith("_") else ("geometry", "fitting", "implicit", "extensions", "analysis")
+        there = "".join(f"; mpm.{r}.{name} is one" for r in rooms if hasattr(_import_module(f"{__name__}.{r}"), name))
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{there}")
     module = _import_module(_HOMES[name])
     globals()[name] = module if module.__name__ == f"{__name__}.{name}" else getattr(module, name)
     return globals()[name]

@@ -236,21 +236,21 @@ def test_a_study_has_a_row_for_each_combination(folder, tmp_path):
     out = tmp_path / "study.csv"
     words = ("run", folder / "scene.toml", "-o", out, "--vary")
     counted = integrate._cached._cache_size()
-    spans = "material.poisson_ratio=0.1:0.5:3", "--vary", "material.youngs_modulus=1e4:1e6:3:log"
+    spans = "material.poisson_ratio=0.1:0.5:2", "--vary", "material.youngs_modulus=1e4:1e6:3:log"
     code, said, err = shell(*words, *spans)
     assert code == 0, err
     assert integrate._cached._cache_size() <= counted + 1
-    assert "9 of 9: material.poisson_ratio=0.5" in said
-    assert f"written {out} (9 rows, 3 of runs that failed)" in said
+    assert "6 of 6: material.poisson_ratio=0.5" in said
+    assert f"written {out} (6 rows, 3 of runs that failed)" in said
     rows = list(csv.DictReader(out.open(encoding="utf-8")))
     stiffness = [float(row["material.youngs_modulus"]) for row in rows]
-    np.testing.assert_allclose(stiffness, [1e4, 1e5, 1e6] * 3)
-    assert [bool(row["failure"]) for row in rows] == [False] * 6 + [True] * 3
+    np.testing.assert_allclose(stiffness, [1e4, 1e5, 1e6] * 2)
+    assert [bool(row["failure"]) for row in rows] == [False] * 3 + [True] * 3
     assert "poisson_ratio must be strictly between" in rows[-1]["failure"]
-    changes = [f"--set={key}={rows[3][key]}" for key in ("material.poisson_ratio", "material.youngs_modulus")]
+    changes = [f"--set={key}={rows[1][key]}" for key in ("material.poisson_ratio", "material.youngs_modulus")]
     assert shell("run", folder / "scene.toml", "-o", tmp_path / "one.vtkhdf", *changes)[0] == 0
     for name, column in mpm.table(tmp_path / "one.vtkhdf").items():
-        assert float(rows[3][name]) == column[-1] or np.isnan(column[-1]), name
+        assert float(rows[1][name]) == column[-1] or np.isnan(column[-1]), name
     assert "exists: choose another name" in refused(*words, "material.poisson_ratio=0.1:0.2:2")
     assert "must be a whole number" in refused(*words, "run.save_every=1:2:2", "--overwrite")
     assert "change neither particles nor nodes" in refused(

@@ -52,7 +52,7 @@ def told(way: str, method: str, program: str = PROGRAM) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("method", ["explicit", *thorough("semi_implicit")])
+@pytest.mark.parametrize("method", thorough("explicit", "semi_implicit"))
 def test_a_program_that_xla_divides_gathers_nothing(method):
     """It calls no library, which would need whole arrays, and each member has its own value and derivative."""
     found = json.loads(told("divided", method))

@@ -333,6 +333,11 @@ def test_a_bad_fit_table_gets_one_line(bar, old, new, says):
     assert re.search(says, refused("fit", bar / "bad.toml"))
 
 
+def test_a_path_past_named_materials_is_told_their_names(bar):
+    (bar / "named.toml").write_text(BAR.replace("[material]", "[material.gel]") + FIT)
+    assert "name one of several before it, by its number from 0 or as gel." in refused("fit", bar / "named.toml")
+
+
 def test_a_file_without_a_fit_says_so(bar):
     assert "has no [fit] table" in refused("fit", bar / "plain.toml")
 

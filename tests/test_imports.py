@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import mpmjax as mpm
+
 PACKAGE = Path(__file__).parents[1] / "mpmjax"
 MAP = PACKAGE.parent / "CONTRIBUTING.md"
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
@@ -110,6 +112,13 @@ def test_no_file_name_stands_twice():
 def test_files_are_small(name):
     """One noun a file, of at most 420 lines."""
     assert len(FILES[name].read_text().splitlines()) <= 420
+
+
+def test_a_name_of_a_room_is_not_found_at_the_top_and_says_where_it_is():
+    with pytest.raises(AttributeError, match=r"no attribute 'Union'; mpm\.geometry\.Union is one$"):
+        mpm.Union  # noqa: B018
+    with pytest.raises(AttributeError, match=r"no attribute 'Onion'$"):
+        mpm.Onion  # noqa: B018
 
 
 def test_importing_changes_no_configuration_and_computes_nothing():

@@ -45,6 +45,7 @@ def equations_cited(text):
     return {number for pair in cited for number in pair if number}
 
 
+@pytest.mark.thorough
 def test_quick_start_runs_as_written_and_ends_in_a_gradient(tmp_path):
     """The README's Python block, run as a fresh program, prints the gradient that the README states."""
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)

@@ -94,6 +94,7 @@ def test_the_memory_is_that_asked_for(steps, budget):
         assert adjoint.lengths == (steps,)
 
 
+@pytest.mark.thorough
 def test_less_memory_is_taken_where_less_is_given():
     """By the compiled program, of the same derivative."""
 

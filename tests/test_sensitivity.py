@@ -53,6 +53,7 @@ def bar_limit():
     return low
 
 
+@pytest.mark.thorough
 def test_free_flight_has_growth_one():
     """To rounding: a bar thrown as a whole, and a single particle, whatever its velocity."""
     scene, particles, _ = bar()

@@ -78,6 +78,7 @@ def agree(found, expected, tolerance=1e-11):
     jax.tree.map(lambda a, b: assert_close(a, b, tolerance, 4e-15), found, expected)
 
 
+@pytest.mark.thorough
 @NEEDS_LIBRARY
 @pytest.mark.parametrize(("d", "all_kinds"), [(2, False), *thorough((2, True), (3, True))])
 def test_frames_and_observations_keep_the_order_given(d, all_kinds, monkeypatch):

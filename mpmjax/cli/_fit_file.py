@@ -146,6 +146,7 @@ def leaf_of(path: str, experiment: Experiment) -> Any:
             value = value[int(name)] if name.isdecimal() else getattr(value, name)
         except (AttributeError, IndexError, TypeError):
             one = ": name one of several before it, by its number from 0" if isinstance(value, tuple) else ""
+            one += f" or as {', '.join(materials)}" if materials and value is experiment.scene.material else ""
             raise ValueError(f"[fit] names {path!r}, but there is no {name!r} there{one}.") from None
     return value
 

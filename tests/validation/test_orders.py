@@ -275,16 +275,12 @@ def test_what_a_period_costs(method, expected):
         assert abs(error / figure - 1) < 0.1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("held", "least", "most"),
     [
         (mpm.ClampPlane(0, 0.0), 1.9, 0.016),
-        pytest.param(
-            mpm.Grip(mpm.Box((-9.0, -9.0), (0.0, 9.0)), mpm.Motion((0.0,), ((0.0, 0.0),))),
-            1.1,
-            0.12,
-            marks=pytest.mark.thorough,
-        ),
+        (mpm.Grip(mpm.Box((-9.0, -9.0), (0.0, 9.0)), mpm.Motion((0.0,), ((0.0, 0.0),))), 1.1, 0.12),
     ],
     ids=["clamp", "grip"],
 )
