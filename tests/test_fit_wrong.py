@@ -371,7 +371,7 @@ def test_a_floor_that_stands_elsewhere_is_among_what_the_fit_advises():
         fit(seen, stiffness(4e4) | {"place": place})
 
 
-@pytest.mark.parametrize(("drift", "says"), [(0.0, "falls with"), *thorough((0.02, "does not fall with"))])
+@pytest.mark.parametrize(("drift", "says"), thorough((0.0, "falls with"), (0.02, "does not fall with")))
 def test_a_fit_on_finer_grids_starts_from_all_minima_and_says_what_its_misfit_is(drift, says, both_grids):
     """From twice the truth the coarse grid has several minima, from each of which the finer one starts. Its misfit
     falls with the spacing; one of a sensor that drifts does not."""

@@ -99,6 +99,7 @@ def test_files_hold_weights_of_several_shapes():
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.thorough
 def test_a_run_whose_law_holds_a_network_is_saved_loaded_resumed_and_drawn(tmp_path, monkeypatch):
     """Bit for bit, with functions that have names and that have none; without its class the file is refused."""
     mpm.register(Perceptron)

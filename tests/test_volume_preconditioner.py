@@ -67,7 +67,7 @@ def test_it_is_symmetric_and_definite_and_its_inverse_is_one(extent, description
     np.testing.assert_allclose(W[held], np.eye(len(W))[held], atol=0)
 
 
-@pytest.mark.parametrize("d", [2, *thorough(3)])
+@pytest.mark.parametrize("d", thorough(2, 3))
 def test_its_eigenvalues_are_between_those_of_shear_and_those_of_lumping_whatever_the_bulk_modulus(d):
     """W⁻¹A is a mean of P⁻¹A0, of shear alone, and of the average's stiffness over the lumped one, which is from 4⁻ᵈ,
     for volumes that alternate from node to node with two particles along a cell's edge, to 1."""
