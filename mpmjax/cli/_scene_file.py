@@ -146,10 +146,8 @@ def read_simulation(
     file = read_scene_file(path, changes)
     run, choice = file.run, None
     t1, dt, method, save_every = run.t1, step_of(path, file), run.method, run.save_every
-    require(
-        most_seconds is None or dt is None or method is None,
-        "--most-seconds is for pilot runs, and there are none: the file gives dt and method.",
-    )
+    piloted = most_seconds is None or dt is None or method is None
+    require(piloted, "--most-seconds is for pilot runs, and there are none: the file gives dt and method.")
     if dt is not None and run.dt == "stable":
         steps = round(t1 / dt)
         choice = f"dt = {dt:.6g} s ({steps} steps), the longest that is stable as the particles start"
@@ -239,10 +237,8 @@ def _filled(scene: Scene, tables: list[Any], dtype: str | None) -> tuple[Particl
         one = f"the number of a [[material]], from 1 to {len(scene.laws)}"
         if scene.names:
             one = f"the name of a [material.NAME], {', '.join(scene.names)}, or its number"
-        require(
-            type(material) is int and material in range(1, len(scene.laws) + 1),
-            f"{where} material must be {one}, got {shortened(repr(material))}.",
-        )
+        fits = type(material) is int and material in range(1, len(scene.laws) + 1)
+        require(fits, f"{where} material must be {one}, got {shortened(repr(material))}.")
         keys = arguments(fill, rest, where, without=("grid", "dtype"))
         region: AbstractRegion = keys["region"]
         try:

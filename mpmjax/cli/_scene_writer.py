@@ -46,9 +46,8 @@ def save_scene(
     path = Path(path)
     require(path.suffix == ".toml", f"A scene file's name must end in .toml, got {path}.")
     start = path.with_suffix(".start.vtkhdf")
-    require(
-        not is_traced((scene, particles)), "A scene inside a jax transformation has no values yet: save it outside."
-    )
+    concrete = not is_traced((scene, particles))
+    require(concrete, "A scene inside a jax transformation has no values yet: save it outside.")
     for place in (path, start):
         require(not place.exists(), f"{place} exists: remove it, or choose another name.")
     prepared = prepare(scene, particles)

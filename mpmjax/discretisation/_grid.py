@@ -83,14 +83,10 @@ class Grid(eqx.Module):
         )
         for name, value in (("origin", self.origin), ("periodic", self.periodic)):
             require(len(value) == d, f"A grid's {name} must have {d} entries, one a direction, got {value}.")
-        require(
-            all(abs(i) + n < _MOST_NODES for i, n in zip(self.origin, self.shape, strict=True)),
-            f"A grid's origin must be of fewer than 2^31 nodes in size, got {self.origin}.",
-        )
-        require(
-            not (self.follow and any(self.periodic)),
-            "A periodic grid cannot follow the material: its window is its period. Drop follow=True or periodic.",
-        )
+        near = all(abs(i) + n < _MOST_NODES for i, n in zip(self.origin, self.shape, strict=True))
+        require(near, f"A grid's origin must be of fewer than 2^31 nodes in size, got {self.origin}.")
+        fits = not (self.follow and any(self.periodic))
+        require(fits, "A periodic grid cannot follow the material: its window is its period. Drop follow or periodic.")
         require(
             not self.axisymmetric or (d == 2 and not self.periodic[0]),
             f"An axisymmetric grid must have two directions, r and z, and no period along r, got the shape {self.shape}"

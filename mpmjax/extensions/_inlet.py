@@ -146,10 +146,8 @@ class Outlet(eqx.Module):
 
     def __check_init__(self):
         require_fields(self)
-        require(
-            self.rest is None or coordinates("An Outlet's rest", self.rest) == self.region.dim,
-            f"An Outlet's rest must have {self.region.dim} coordinates, as its region, got {self.rest}.",
-        )
+        fits = self.rest is None or coordinates("An Outlet's rest", self.rest) == self.region.dim
+        require(fits, f"An Outlet's rest must have {self.region.dim} coordinates, as its region, got {self.rest}.")
 
     def __call__(
         self, scene: Scene, particles: Particles, t: Scalar, dt: Scalar, memory: Any

@@ -47,10 +47,8 @@ class Rigid(AbstractMaterial):
 
     def __check_init__(self):
         require_fields(self)
-        require(
-            self.free is None or len(self.free) in (1, 2, 3),
-            f"Rigid's free directions must be one bool for each of the scene's, got {self.free}.",
-        )
+        fits = self.free is None or len(self.free) in (1, 2, 3)
+        require(fits, f"Rigid's free directions must be one bool for each of the scene's, got {self.free}.")
 
     def constraint(self, number: int, layer: int) -> "RigidConstraint":  # pyright: ignore[reportIncompatibleVariableOverride]
         """The constraint on how a body of it moves."""
@@ -138,10 +136,8 @@ class RigidConstraint(AbstractConstraint):
             "plane at rest.",
         )
         d = scene.grid.dim
-        require(
-            self.free is None or len(self.free) == d,
-            f"Rigid's free directions must be {d} bools, as the grid has directions, got {self.free}.",
-        )
+        fits = self.free is None or len(self.free) == d
+        require(fits, f"Rigid's free directions must be {d} bools, as the grid has directions, got {self.free}.")
 
     def check_particles(self, x: np.ndarray, spacing: float) -> None:
         spread, needed = np.linalg.svd(x - x.mean(axis=0), compute_uv=False), x.shape[1] - 1

@@ -63,10 +63,8 @@ class VolumePreconditioner(AbstractPreconditioner):
 
     def __check_init__(self):
         require_fields(self)
-        require(
-            self.extent is None or (len(self.extent) > 0 and all(length >= 1 for length in self.extent)),
-            f"VolumePreconditioner's extent must be a number of nodes from 1 for each axis, got {self.extent}.",
-        )
+        fits = self.extent is None or (len(self.extent) > 0 and all(length >= 1 for length in self.extent))
+        require(fits, f"VolumePreconditioner's extent must be one node or more for each axis, got {self.extent}.")
 
     def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
         operator = operator.precomputed()
@@ -79,10 +77,8 @@ class VolumePreconditioner(AbstractPreconditioner):
             return diagonal  # B then sees no box of nodes, or a hoop that it does not know
         window = shape = averaged[0].average.shape
         if self.extent is not None:
-            require(
-                len(self.extent) == len(window),
-                f"VolumePreconditioner's extent must have a number for each of {len(window)} axes, got {self.extent}.",
-            )
+            fits = len(self.extent) == len(window)
+            require(fits, f"VolumePreconditioner's extent needs {len(window)} numbers, one an axis, got {self.extent}.")
             shape = tuple(min(pair) for pair in zip(self.extent, window, strict=True))
         # how many nodes away B sees along an axis: as far as a hat and a spline of so many cells overlap
         half = math.ceil(1 + len(stiffness.stencil.basis.knots) / 2) - 1

@@ -56,9 +56,8 @@ class Columns:
             require(head.count(name) == 1, f"{path}, line {self.header_line}: the column {name!r} is there twice.")
         require(len(rows) > 0, f"{path} has a header and no rows: there is nothing to fit.")
         for line, fields in rows:
-            require(
-                len(fields) == len(head), f"{path}, line {line}: {len(fields)} fields, but the header has {len(head)}."
-            )
+            full = len(fields) == len(head)
+            require(full, f"{path}, line {line}: {len(fields)} fields, but the header has {len(head)}.")
         self.lines = np.array([line for line, _ in rows])  # the line of each row, from 1
         self._data = {
             name: np.array([self._number(n, name, row[head.index(name)]) for n, row in rows]) for name in names

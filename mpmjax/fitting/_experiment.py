@@ -237,9 +237,8 @@ class Experiment(eqx.Module):
         self.scene, self.method = canonical((scene, method), particles.x.dtype)
         self.t1, self.dt, self.name = float(t1), float(dt), name
         self.observations = (observations,) if isinstance(observations, AbstractObservation) else tuple(observations)
-        require(
-            len(self.observations) > 0, f"The experiment {name!r} needs an observation at least: what was measured."
-        )
+        any_seen = len(self.observations) > 0
+        require(any_seen, f"The experiment {name!r} needs an observation at least: what was measured.")
         number_of_steps(self.t1, self.dt, 0, particles.x.dtype)
         for observation in self.observations:
             observation.check(self.scene, self.particles, self.t1)

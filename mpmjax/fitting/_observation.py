@@ -49,10 +49,8 @@ class Markers(eqx.Module):
         Each moves as the mean of its nearest particles, by shares of least squares: exact of affine motion."""
         x, places = np.asarray(particles.x, float), np.asarray(places, float)
         d = particles.dim
-        require(
-            places.ndim == 2 and places.shape[1] == d and len(places) > 0,
-            f"Markers need places of shape (m, {d}), got {places.shape}.",
-        )
+        fits = places.ndim == 2 and places.shape[1] == d and len(places) > 0
+        require(fits, f"Markers need places of shape (m, {d}), got {places.shape}.")
         k = min(_NEIGHBOURS**d, particles.count)
         require(k > d, f"Markers between particles need more than {d} of them, got {particles.count}.")
         from scipy.spatial import KDTree  # here, since it takes long to import
@@ -136,9 +134,8 @@ class StressStretch(eqx.Module):
         """Stretch [-] and nominal stress [Pa]."""
         (points,) = scene.material_points(particles)
         F, a = points.deformation, self.axis
-        require(
-            F.ndim == 3, f"The curve of a tension test needs a law of F, got {type(points.law).__name__}, of J alone."
-        )
+        of_F = F.ndim == 3
+        require(of_F, f"The curve of a tension test needs a law of F, got {type(points.law).__name__}, of J alone.")
         P = points.stress(F)
         return (self.weight * F[a, a]).sum(), (self.weight * P[a, a]).sum()
 
@@ -167,10 +164,8 @@ class Density(eqx.Module):
     def of_points(self, points: Rows, mass: Scalar) -> np.ndarray:
         """The picture of points [m], shape (m, d), which share the body's mass [kg] evenly."""
         points = jnp.asarray(points, float)
-        require(
-            points.ndim == 2 and points.shape[1] == self.grid.dim and len(points) > 0,
-            f"A cloud needs points of shape (m, {self.grid.dim}), got {points.shape}.",
-        )
+        fits = points.ndim == 2 and points.shape[1] == self.grid.dim and len(points) > 0
+        require(fits, f"A cloud needs points of shape (m, {self.grid.dim}), got {points.shape}.")
         return np.asarray(self._picture(points, jnp.full(len(points), mass / len(points))))
 
     def _picture(self, x: ParticleVector, mass: ParticleScalar) -> Array:
@@ -199,10 +194,8 @@ class Curve(AbstractObservation):
 
     def __check_init__(self):
         require_fields(self)
-        require(
-            self.x.ndim == 1 and self.x.shape == self.data.shape,
-            f"{self.title} needs x and data of one shape (m,), got {self.x.shape} and {self.data.shape}.",
-        )
+        alike = self.x.ndim == 1 and self.x.shape == self.data.shape
+        require(alike, f"{self.title} needs x and data of one shape (m,), got {self.x.shape} and {self.data.shape}.")
         require_finite(f"The abscissae of {self.title}", self.x)
 
     @property
@@ -346,10 +339,8 @@ class Tracks(AbstractTimed):
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         super().check(scene, particles, t1)
-        require(
-            self.data.shape[2] == particles.dim,
-            f"{self.title} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.",
-        )
+        alike = self.data.shape[2] == particles.dim
+        require(alike, f"{self.title} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.")
         self.which.check(self.name, particles.count)
 
 

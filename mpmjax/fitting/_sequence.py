@@ -235,10 +235,8 @@ def fit_refined(
         ValueError: fewer than two refinements, or not growing ones; see `fit`.
     """
     numbers = list(refinements)
-    require(
-        len(numbers) >= 2 and numbers[0] >= 1 and all(a < b for a, b in pairwise(numbers)),
-        f"refinements must be two or more growing whole numbers, got {numbers}.",
-    )
+    grow = len(numbers) >= 2 and numbers[0] >= 1 and all(a < b for a, b in pairwise(numbers))
+    require(grow, f"refinements must be two or more growing whole numbers, got {numbers}.")
     fits, start, places = list[FitResult](), parameters, as_starts(starts)
     options: dict[str, Any] = {"report": report, "level": level, "optimiser": optimiser, "progress": progress}
     for n in numbers:

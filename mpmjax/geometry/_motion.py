@@ -122,10 +122,8 @@ class RigidMotion(AbstractMotion):
         require(d in (2, 3), f"A rigid motion is two- or three-dimensional, got {d} coordinates: take a Motion.")
         expected = (len(self.times),) if d == 2 else (len(self.times), 3)
         require(shape == expected, f"A rigid motion's rotation must have shape {expected} here, got {shape}.")
-        require(
-            coordinates("A rigid motion's centre", self.centre) == d,
-            f"A rigid motion's centre must have {d} coordinates, as its displacement has, got {self.centre}.",
-        )
+        fits = coordinates("A rigid motion's centre", self.centre) == d
+        require(fits, f"A rigid motion's centre must have {d} coordinates, as its displacement has, got {self.centre}.")
 
     def rests(self) -> bool:
         return _constant(self.displacement) and _constant(self.rotation)
@@ -174,10 +172,8 @@ def _check_rows(owner: str, values: str, times: Times, rows: Any, *, axes: tuple
     """Check that increasing times have one row each of some values, with so many axes."""
     j, shape = shape_of(times), shape_of(rows)
     kind = "row" if axes == (2,) else "number or row"
-    require(
-        len(j) == 1 and len(shape) in axes and j[0] == shape[0] > 0,
-        f"{owner} {values} must be one {kind} a time, one time at least, got shapes {j} and {shape}.",
-    )
+    fits = len(j) == 1 and len(shape) in axes and j[0] == shape[0] > 0
+    require(fits, f"{owner} {values} must be one {kind} a time, one time at least, got shapes {j} and {shape}.")
     require_that(f"{owner} times must increase", lambda t: t[1:] > t[:-1], times)
 
 

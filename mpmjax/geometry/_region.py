@@ -96,10 +96,8 @@ def box_cells(lower: np.ndarray, upper: np.ndarray, size: np.ndarray) -> Cells:
 
 def check_corners(name: str, lower: Any, upper: Any, hint: str = "") -> None:
     """Check that two corners of a box have as many coordinates, the lower one's below the upper one's."""
-    require(
-        coordinates(f"{name}'s lower corner", lower) == coordinates(f"{name}'s upper corner", upper),
-        f"{name} needs two corners with as many coordinates, got {lower} and {upper}.",
-    )
+    alike = coordinates(f"{name}'s lower corner", lower) == coordinates(f"{name}'s upper corner", upper)
+    require(alike, f"{name} needs two corners with as many coordinates, got {lower} and {upper}.")
     below = f"{name}'s lower corner must lie below its upper one in each direction{hint}"
     require_that(below, lambda a, b: a < b, lower, upper)  # false of what is not a number
 
@@ -156,10 +154,8 @@ class HalfSpace(AbstractRegion):
 
     def __check_init__(self):
         require_fields(self)
-        require(
-            coordinates("A half-space's point", self.point) == coordinates("A half-space's normal", self.normal),
-            f"A half-space needs a point and a normal with as many coordinates, got {self.point} and {self.normal}.",
-        )
+        alike = coordinates("A half-space's point", self.point) == coordinates("A half-space's normal", self.normal)
+        require(alike, f"A half-space's point and normal need as many coordinates, got {self.point} and {self.normal}.")
         require_that("A half-space's normal must not be zero", lambda a: (a != 0).any(), self.normal)
 
     @property

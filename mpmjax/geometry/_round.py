@@ -100,10 +100,8 @@ class AbstractRound(AbstractRegion):
     def __check_init__(self):
         require_fields(self)
         name, start, end = f"A {type(self).__name__.lower()}", self.start, self.end
-        require(
-            coordinates(f"{name}'s start", start) == coordinates(f"{name}'s end", end),
-            f"{name} needs two ends with as many coordinates, got {start} and {end}.",
-        )
+        alike = coordinates(f"{name}'s start", start) == coordinates(f"{name}'s end", end)
+        require(alike, f"{name} needs two ends with as many coordinates, got {start} and {end}.")
         require_that(f"{name}'s ends must differ", lambda a, b: (a != b).any(), start, end)
 
     @property

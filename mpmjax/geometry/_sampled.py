@@ -198,9 +198,8 @@ def _volume(region: AbstractRegion, values: np.ndarray, points: np.ndarray, spac
 
 def _lattice(lower: np.ndarray, upper: np.ndarray, spacing: float, hint: str = "") -> np.ndarray:
     """The points of a lattice around a bounding box, (..., d); `hint` ends what is said of one that is too large."""
-    require(
-        np.isfinite(lower) & np.isfinite(upper), f"Only a region with bounds can be sampled, got {lower} to {upper}."
-    )
+    bounded = np.isfinite(lower) & np.isfinite(upper)
+    require(bounded, f"Only a region with bounds can be sampled, got {lower} to {upper}.")
     first = lower - _PADDING * spacing
     with np.errstate(over="ignore"):
         numbers = np.ceil((upper - lower) / spacing) + 2 * _PADDING + 1

@@ -210,14 +210,10 @@ def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
     require_positive("dt [s]", dt, dtype)
     require_finite("t1 [s]", t1)
     ratio, exact = float(t1) / float(dt), 2 ** (jnp.finfo(dtype).nmant - 1)
-    require(
-        ratio <= MOST_STEPS,
-        f"A run has at most {MOST_STEPS} steps, got t1 / dt = {ratio:.9g}: choose a shorter t1 or a longer dt.",
-    )
-    require(
-        ratio < exact,
-        f"{jnp.dtype(dtype)} counts steps exactly only below {exact}, got t1 / dt = {ratio:.9g}: use float64.",
-    )
+    few = ratio <= MOST_STEPS
+    require(few, f"A run has at most {MOST_STEPS} steps, got t1 / dt = {ratio:.9g}: choose a shorter t1 or longer dt.")
+    few = ratio < exact
+    require(few, f"{jnp.dtype(dtype)} counts steps exactly only below {exact}, got t1 / dt = {ratio:.9g}: use float64.")
     total = round(ratio)
     require(
         abs(ratio - total) <= 1e-6 * max(1.0, abs(ratio)),

@@ -70,10 +70,8 @@ class AttachedPoints(AbstractPlace):
         k, s = shape_of(self.particle), shape_of(self.weight)
         rows = [shape_of(a) for a in (self.offset, self.place, self.area) if a is not None]
         columns = [None if a is None else shape_of(a)[:2] for a in (self.share, self.moment)]
-        require(
-            len(s) == 1 and all(r[:1] == s for r in rows) and s[0] > 0 and k in (s, (*k[:1], *s)),
-            f"AttachedPoints need one row a point in each of their arrays, got {k}, {s} and {rows}.",
-        )
+        alike = len(s) == 1 and all(r[:1] == s for r in rows) and s[0] > 0 and k in (s, (*k[:1], *s))
+        require(alike, f"AttachedPoints need one row a point in each of their arrays, got {k}, {s} and {rows}.")
         require(
             columns == [None if k == s else k] * 2,
             f"AttachedPoints with columns need a share and a moment for each particle {k}, others none, got {columns}.",
@@ -229,14 +227,10 @@ class PointsAt(AbstractPlace):
 
 def _positions(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, float]:
     """The particles' positions, and the distance between them [m]."""
-    require(
-        not is_traced((particles.x, particles.volume, particles.deformations, place)),
-        "Loads are attached to particles that are known: call attach outside of the jax transformation.",
-    )
-    require(
-        place.dim == particles.dim,
-        f"{type(place).__name__} must have {particles.dim} coordinates, as the particles have, got {place.dim}.",
-    )
+    concrete = not is_traced((particles.x, particles.volume, particles.deformations, place))
+    require(concrete, "Loads are attached to particles that are known: call attach outside of the jax transformation.")
+    fits = place.dim == particles.dim
+    require(fits, f"{type(place).__name__} must have {particles.dim} coordinates, as the particles, got {place.dim}.")
     volume = np.asarray(particles.volume)
     return np.asarray(particles.x, float), float(np.median(volume[volume > 0]) ** (1 / particles.dim))
 
@@ -271,10 +265,8 @@ def _attached(
     """Points at positions [m] on particles, (k, s), with undeformed offsets, moments and areas (Nanson's formula):
     A = Fᵀ a / det F."""
     dtype = particles.x.dtype
-    require(
-        particles.count < 2 ** (jnp.finfo(dtype).nmant + 1),
-        f"{dtype} counts particles exactly only below {2 ** (jnp.finfo(dtype).nmant + 1)}: use float64.",
-    )
+    exact = particles.count < 2 ** (jnp.finfo(dtype).nmant + 1)
+    require(exact, f"{dtype} counts particles exactly only below {2 ** (jnp.finfo(dtype).nmant + 1)}: use float64.")
     if len(rows) == 1:
         share = moment = None
     offset = positions - np.asarray(particles.x, float)[rows[0]]

@@ -75,9 +75,8 @@ def fill(
     field = _velocity(velocity, d)
     lower, upper = region.bounds()
     require(lower.shape == (d,), f"The region is {lower.size}-dimensional, the grid {d}-dimensional.")
-    require(
-        np.isfinite(lower) & np.isfinite(upper), "A region to fill must be finite; infinite corners are for grips only."
-    )
+    bounded = np.isfinite(lower) & np.isfinite(upper)
+    require(bounded, "A region to fill must be finite; infinite corners are for grips only.")
     cell = float(grid.spacing) / counts
     with np.errstate(over="ignore"):
         total = np.maximum(np.rint((upper - lower) / cell), 1).prod()

@@ -53,9 +53,8 @@ class AbstractLoad(eqx.Module):
     def check(self, dim: int) -> None:
         """Raise a `ValueError` if it cannot stand in a scene of a dimension. Default: the place has another one."""
         name = type(self).__name__
-        require(
-            self.on.dim == dim, f"{name} must be on a place with {dim} coordinates, as the grid, got {self.on.dim}."
-        )
+        fits = self.on.dim == dim
+        require(fits, f"{name} must be on a place with {dim} coordinates, as the grid, got {self.on.dim}.")
 
     def needs_deformation(self) -> bool:
         """Whether `force` needs the whole deformation gradient, which laws that yield or flow do not keep. Default:
@@ -73,9 +72,8 @@ class AbstractDeadLoad(AbstractLoad):
     def check(self, dim: int) -> None:
         AbstractLoad.check(self, dim)
         size, name = vector_size(getattr(self, self.value)), f"{type(self).__name__}'s {self.value}"
-        require(
-            size == dim, f"{name} must have {dim} components, as the grid has directions, got {size or 'a number'}."
-        )
+        fits = size == dim
+        require(fits, f"{name} must have {dim} components, as the grid has directions, got {size or 'a number'}.")
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
         return points.weight * value_at(getattr(self, self.value), t)[:, None]
@@ -223,10 +221,8 @@ class Spring(AbstractLoad):
         for name, value in (("stiffness", self.stiffness), ("damping", self.damping)):
             shape = () if value is None else shape_of(value)
             require(shape in ((), (dim,)), f"A Spring's {name} must be a number or {dim} of them, got {value}.")
-        require(
-            self.motion is None or self.motion.dim == dim,
-            f"A Spring's motion must have {dim} coordinates, got {self.motion and self.motion.dim}.",
-        )
+        fits = self.motion is None or self.motion.dim == dim
+        require(fits, f"A Spring's motion must have {dim} coordinates, got {self.motion and self.motion.dim}.")
 
     def term(self, points: LoadedPoints, t: Scalar) -> Support:
         """The energy ½ k (x + u − x_0 − d)² and the resistance c."""

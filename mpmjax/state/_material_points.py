@@ -46,10 +46,8 @@ class AveragedVolume(eqx.Module):
 
     def __check_init__(self):
         require_fields(self)
-        require(
-            self.materials is None or (len(self.materials) > 0 and all(number >= 0 for number in self.materials)),
-            f"AveragedVolume's materials must be numbers from 0, at least one of them, got {self.materials}.",
-        )
+        fits = self.materials is None or (len(self.materials) > 0 and all(number >= 0 for number in self.materials))
+        require(fits, f"AveragedVolume's materials must be numbers from 0, at least one of them, got {self.materials}.")
 
     def covers(self, number: int) -> bool:
         """Whether it averages the material of a number."""

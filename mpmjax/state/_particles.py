@@ -62,14 +62,10 @@ class Particles(eqx.Module):
         )
         require(p > 0, "There must be a particle at least, got none.")
         dtypes = {str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in jax.tree.leaves(self)}
-        require(
-            len(dtypes) == 1 and dtypes <= {"float32", "float64"},
-            f"Particles need arrays of one precision, float32 or float64, got {', '.join(sorted(dtypes))}.",
-        )
-        require(
-            self.counts is None or (sum(self.counts) == p and min(self.counts) > 0),
-            f"The counts of the materials' particles must be positive and add up to {p}, got {self.counts}.",
-        )
+        alike = len(dtypes) == 1 and dtypes <= {"float32", "float64"}
+        require(alike, f"Particles need arrays of one precision, float32 or float64, got {', '.join(sorted(dtypes))}.")
+        fits = self.counts is None or (sum(self.counts) == p and min(self.counts) > 0)
+        require(fits, f"The counts of the materials' particles must be positive and add up to {p}, got {self.counts}.")
         lengths = len(self.deformations), len(self.histories)
         require(
             lengths == (len(self.sizes),) * 2,

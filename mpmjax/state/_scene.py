@@ -216,10 +216,8 @@ class Scene(eqx.Module):
             "or leave boundary_forces out.",
         )
         for boundary in self.boundary:
-            require(
-                boundary.dim in (None, d),
-                f"{type(boundary).__name__} must have {d} coordinates, as the grid has, got {boundary.dim}.",
-            )
+            fits = boundary.dim in (None, d)
+            require(fits, f"{type(boundary).__name__} must have {d} coordinates, as the grid has, got {boundary.dim}.")
             boundary.check(self.grid, total=self.total)
         for load in self.loads:
             load.check(d)

@@ -122,10 +122,8 @@ def _whole(limit: Array, t1: Scalar, method: str) -> Float[Array, ""]:
         )
     require_positive("t1 [s]", t1, limit.dtype)
     bound, end = float(limit), float(t1)
-    require(
-        bound < np.inf,
-        f"{method} has no longest stable step here, so accuracy alone decides: give dt as a number of seconds.",
-    )
+    finite = bound < np.inf
+    require(finite, f"{method} has no longest stable step here, so accuracy alone decides: give dt in seconds.")
     require(
         end <= bound * MOST_STEPS,
         f"The longest stable step is {bound:.3g} s, of which t1 = {t1} s takes more than {MOST_STEPS}: choose an "

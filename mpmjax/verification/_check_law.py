@@ -53,10 +53,8 @@ def check_law(law: AbstractLaw, *, dim: int = 3, F: Any = None, rtol: float = 1e
     """
     with jax.enable_x64(True):
         gradients = jnp.asarray(_deformations(dim) if F is None else np.asarray(F, float))
-        require(
-            gradients.ndim == 3 and gradients.shape[1:] == (dim, dim),
-            f"check_law's F must have shape (p, {dim}, {dim}), got {gradients.shape}.",
-        )
+        fits = gradients.ndim == 3 and gradients.shape[1:] == (dim, dim)
+        require(fits, f"check_law's F must have shape (p, {dim}, {dim}), got {gradients.shape}.")
         place = jnp.moveaxis(gradients, 0, -1)
         typed: AbstractLaw = canonical(law, place.dtype)
         elastic = typed.elastic(typed.initial_history(typed.measure.of(place)))

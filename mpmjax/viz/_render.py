@@ -75,9 +75,8 @@ def render(
     quantities = COLOURS | {
         name: (name.replace("_", " "), partial(_remembered, name)) for name, *_ in history_arrays(run.final)
     }
-    require(
-        colour is None or colour in quantities, f"colour must be one of {', '.join(quantities)}, none, got {colour!r}."
-    )
+    fits = colour is None or colour in quantities
+    require(fits, f"colour must be one of {', '.join(quantities)}, none, got {colour!r}.")
     require(run.final.count > 0, "The run has no particles to draw.")
     require(
         frame is None or -len(run) <= frame < len(run), f"The run has {len(run)} frames, there is no frame {frame}."
