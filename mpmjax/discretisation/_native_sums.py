@@ -13,6 +13,7 @@ import numpy as np
 from mpmjax._types import Array
 from mpmjax.discretisation._stencil import Basis
 
+Rows = Sequence[Array]  # values and gradients, (..., c, p), a group each
 Call = Callable[..., list[Array]]
 """A kernel as a function of operands, attributes, and results if they are not those of the sum (see
 `custom_derivative`)."""
@@ -45,15 +46,7 @@ def _given(basis: Basis, amounts: dict[Any, Array]) -> list[Array | None]:
 
 
 def call_scatter(
-    call: Call,
-    first: Array,
-    t: Array,
-    dt: Any,
-    rows: Sequence[Array],
-    *,
-    basis: Basis,
-    groups: Sequence[Any],
-    size: int,
+    call: Call, first: Array, t: Array, dt: Any, rows: Rows, *, basis: Basis, groups: Sequence[Any], size: int
 ) -> Array | None:
     """`scatter_sum`: what is moved and what is not in a call each."""
     if not _have_kernels(basis, groups):
@@ -85,15 +78,7 @@ def _value_and_gradients(t: Array, nodes: Array) -> list[jax.ShapeDtypeStruct]:
 
 
 def call_pull(
-    call: Call,
-    first: Array,
-    t: Array,
-    nodes: Array,
-    rows: Sequence[Array],
-    *,
-    basis: Basis,
-    groups: Sequence[Any],
-    gathered: bool,
+    call: Call, first: Array, t: Array, nodes: Array, rows: Rows, *, basis: Basis, groups: Sequence[Any], gathered: bool
 ) -> tuple[Array, list[Array]] | None:
     """`pull_sum`, and with `gathered` the gather of the nodes."""
     if not _have_kernels(basis, groups):
@@ -107,15 +92,7 @@ def call_pull(
 
 
 def call_average(
-    call: Call,
-    first: Array,
-    t: Array,
-    least: Array,
-    rows: Sequence[Array],
-    *,
-    basis: Basis,
-    groups: Sequence[Any],
-    size: int,
+    call: Call, first: Array, t: Array, least: Array, rows: Rows, *, basis: Basis, groups: Sequence[Any], size: int
 ) -> list[Array]:
     """`average_sum`."""
     amounts = _given(basis, dict(zip((group.terms for group in groups), rows, strict=True)))

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float
 from mpmjax.autodiff import custom_derivative, is_unknown, materialised, saved_for_backward
-from mpmjax.discretisation._native_sums import call_gather, call_pull, call_scatter
+from mpmjax.discretisation._native_sums import Rows, call_gather, call_pull, call_scatter
 from mpmjax.discretisation._stencil import Basis, Stencil, Term, differentiated
 from mpmjax.discretisation._written_sums import Factors, written_gather, written_pull, written_scatter
 
@@ -118,7 +118,7 @@ def _plain(groups: Groups) -> Groups:
     return tuple(Group(differentiated(group.terms) if group.moved else group.terms) for group in groups)
 
 
-def _times(groups: Groups, rows: Sequence[Array], dt: Any) -> list[Array]:
+def _times(groups: Groups, rows: Rows, dt: Any) -> list[Array]:
     """Amounts for the `_plain` groups: a ⊗ dt, dt_b a of all terms for the first axis, the second, ..."""
     return [jnp.concatenate([a * by for by in dt]) if group.moved else a for group, a in zip(groups, rows, strict=True)]
 
@@ -144,15 +144,7 @@ def _factors(basis: Basis, first: Array, t: Array, groups: Groups) -> Factors:
     unrolls=True,
 )
 def scatter_sum(
-    first: Array,
-    t: Array,
-    dt: Any,
-    rows: Sequence[Array],
-    *,
-    basis: Basis,
-    groups: Groups,
-    size: int,
-    unroll: bool = False,
+    first: Array, t: Array, dt: Any, rows: Rows, *, basis: Basis, groups: Groups, size: int, unroll: bool = False
 ) -> Array:
     """∂B/∂f, (n, c), of what particles give to each group."""
     plain = _plain(groups)
@@ -181,7 +173,7 @@ def gather_sum(
 
 @partial(custom_derivative, kernel="pull", call=call_pull)
 def pull_sum(
-    first: Array, t: Array, nodes: Array, rows: Sequence[Array], *, basis: Basis, groups: Groups, gathered: bool
+    first: Array, t: Array, nodes: Array, rows: Rows, *, basis: Basis, groups: Groups, gathered: bool
 ) -> tuple[Array, list[Array]]:
     """∂B/∂t, (d, p), and if `gathered` ∂B/∂a of each group."""
     moved = _plain(_moved(groups))
@@ -202,7 +194,7 @@ def _total(parts: Sequence[Any]) -> Any:
 
 
 def scatter_change(
-    first: Array, t: Array, dt: Any, rows: Sequence[Array], changes: Sequence[Any], groups: Groups, **params: Any
+    first: Array, t: Array, dt: Any, rows: Rows, changes: Sequence[Any], groups: Groups, **params: Any
 ) -> Array | None:
     """The differential of a scatter of groups that are not moved, None if nothing changes."""
     some = [(group, da) for group, da in zip(groups, changes, strict=True) if da is not None]
@@ -220,7 +212,7 @@ def scatter_change(
 def _(primals: tuple, tangents: tuple, *, groups: Groups, **params: Any) -> tuple[Array, Any]:
     if primals[2] is not None:
 
-        def plain(first: Array, t: Array, dt: Array, rows: Sequence[Array]) -> Array:
+        def plain(first: Array, t: Array, dt: Array, rows: Rows) -> Array:
             return scatter_sum(first, t, None, _times(groups, rows, dt), groups=_plain(groups), **params)
 
         return eqx.filter_jvp(plain, primals, tangents)
@@ -248,7 +240,7 @@ def _(primals: tuple, tangents: tuple, *, groups: Groups, **params: Any) -> tupl
 def _(primals: tuple, tangents: tuple, *, groups: Groups, gathered: bool, **params: Any) -> tuple:
     if gathered:
 
-        def apart(first: Array, t: Array, nodes: Array, rows: Sequence[Array]) -> tuple[Array, list[Array]]:
+        def apart(first: Array, t: Array, nodes: Array, rows: Rows) -> tuple[Array, list[Array]]:
             by_t, _ = pull_sum(first, t, nodes, rows, groups=groups, gathered=False, **params)
             return by_t, gather_sum(first, t, None, nodes, groups=groups, **params)
 

@@ -132,11 +132,7 @@ class NodeBox(eqx.Module):
 
 
 def nodal_coupling(
-    transpose: Callable[[Float[Array, "a n"]], NodeVector],
-    weight: NodeVector,
-    some: Bool[Array, "a m"],
-    box: NodeBox,
-    half: int,
+    transpose: Callable[[Array], NodeVector], weight: NodeVector, some: Bool[Array, "a m"], box: NodeBox, half: int
 ) -> Float[Array, "a b s m"]:
     """B P⁻¹ Bᵀ: its entry for each number of node i and of node j = i + δ, by δ from −2 half to 2 half along each axis.
 
@@ -144,7 +140,7 @@ def nodal_coupling(
     of the vectors then couples all pairs of nodes that see it.
 
     Args:
-        transpose: Bᵀ.
+        transpose: Bᵀ, of arrays (a, n).
         weight: the diagonal of P, shape (n, d).
         some: which numbers in the box count; the others' rows and columns are zero.
         box: the nodes that S couples.

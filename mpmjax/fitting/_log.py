@@ -37,17 +37,13 @@ _ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), (
 _MOST = 8  # numbers of an array that are written out
 _FREE = ("optimiser.max_steps",)  # choices that may differ in a fit that is continued: it may go on for longer
 
+Progress = Callable[[str], None]
 Past = tuple[int, tuple[Iteration, ...], FitProblem, Search]  # rounds before the last, their iterations; the last one
 
 
 @contextmanager
 def recorded(
-    problem: FitProblem,
-    optimiser: AbstractOptimiser,
-    progress: Callable[[str], None] | None,
-    path: Path | None,
-    *,
-    resume: bool,
+    problem: FitProblem, optimiser: AbstractOptimiser, progress: Progress | None, path: Path | None, *, resume: bool
 ) -> Iterator[tuple[Past | None, Callable[[FitProblem, Search], None]]]:
     """The past of a fit that a log holds, if it is to `resume`, and a function that records a search, of the problem
     with the noise of its round, after each iteration: in the log at this path, by lines of progress, or both."""
@@ -247,7 +243,7 @@ def _digest(data: bytes) -> str:
 
 
 def _lines(
-    problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None], done: int
+    problem: FitProblem, optimiser: AbstractOptimiser, say: Progress, done: int
 ) -> Callable[[Search, float], None]:
     """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left of the present search,
     after a first one that an iteration is compiled; `done` are in the log. The time left is the median time of an

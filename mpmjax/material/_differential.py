@@ -14,6 +14,8 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix
 from mpmjax.autodiff import custom_derivative
 
+Entry = Callable[[int, int], Array]  # a number a particle, of directions i and j
+
 _STRETCHES = (1.25, 0.8, 1.0)
 """Where a law is asked whether it is isotropic: they differ and keep the volume, whose energy may hide the rest."""
 _ANISOTROPIC = 1e-4
@@ -69,17 +71,11 @@ class PrincipalDifferential(eqx.Module):
     scaling: Matrix  # ∂²Ψ/∂s_i∂s_j [Pa], shape (d, d, *p)
 
     @classmethod
-    def of(
-        cls,
-        s: Float[Array, "d *p"],
-        twist: Callable[[int, int], Array],
-        flip: Callable[[int, int], Array],
-        scaling: Callable[[int, int], Array],
-    ) -> "PrincipalDifferential":
+    def of(cls, s: Float[Array, "d *p"], twist: Entry, flip: Entry, scaling: Entry) -> "PrincipalDifferential":
         """From functions of i and j at signed principal stretches s [-]: twist and flip if i < j, scaling [Pa]."""
         d, none = s.shape[0], jnp.zeros((0, *s.shape[1:]), s.dtype)
 
-        def over_pairs(entry: Callable[[int, int], Array]) -> Array:
+        def over_pairs(entry: Entry) -> Array:
             return jnp.stack([entry(i, j) for i, j in la.pairs(d)]) if d > 1 else none
 
         entries = [[scaling(i, j) for j in range(d)] for i in range(d)]
@@ -87,11 +83,7 @@ class PrincipalDifferential(eqx.Module):
 
     @classmethod
     def of_kirchhoff(
-        cls,
-        s: Float[Array, "d *p"],
-        tau: Float[Array, "d *p"],
-        growth: Callable[[int, int], Array],
-        slope: Callable[[int, int], Array],
+        cls, s: Float[Array, "d *p"], tau: Float[Array, "d *p"], growth: Entry, slope: Entry
     ) -> "PrincipalDifferential":
         """From the principal Kirchhoff stresses τ_i = s_i ∂Ψ/∂s_i [Pa], ∂τ_i/∂ln s_j and (τ_i − τ_j)/(s_i − s_j) [Pa]:
         twist (τ_i/s_i + τ_j/s_j)/(s_i + s_j), flip (s_j (τ_i − τ_j)/(s_i − s_j) − τ_j)/(s_i s_j), scaling

@@ -1,6 +1,5 @@
 """Elastic laws: fixed corotated and neo-Hookean."""
 
-from collections.abc import Callable
 from typing import Annotated
 
 import jax
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.checks import between, positive, require_fields
-from mpmjax.material._differential import IsotropicDifferential, PrincipalDifferential
+from mpmjax.material._differential import Entry, IsotropicDifferential, PrincipalDifferential
 from mpmjax.material._law import AbstractMaterial
 
 YoungsModulus = Annotated[PerParticle, positive, "Pa"]
@@ -156,9 +155,7 @@ class NeoHookeanDifferential(IsotropicDifferential):
         return jnp.stack([entry(*row, *column) for k, row in enumerate(places) for column in places[k:]])
 
 
-def _with_volumetric(
-    s: Array, pull: Array, bulk: Array, twist: Callable[[int, int], Array], stiffness: Array
-) -> PrincipalDifferential:
+def _with_volumetric(s: Array, pull: Array, bulk: Array, twist: Entry, stiffness: Array) -> PrincipalDifferential:
     """The eigenstructure of a law with P = deviatoric part + q J F⁻ᵀ, q = `pull` and b = dq/dJ = `bulk`.
 
     δ(q J F⁻ᵀ) = b (J F⁻ᵀ : δF) J F⁻ᵀ + q δ(J F⁻ᵀ) has twist q J/(s_i s_j), flip −q J/(s_i s_j) and scaling

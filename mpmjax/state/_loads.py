@@ -1,6 +1,7 @@
 """Loads on a body's surface and at points of it, and springs and dashpots to the ground."""
 
 import abc
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, ClassVar
 
@@ -245,12 +246,7 @@ def _along(coefficient: Scalar | Point, points: LoadedPoints) -> Float[Array, "d
 
 
 def points_of(
-    loads: tuple[AbstractLoad, ...],
-    laws: tuple[AbstractLaw, ...],
-    particles: Particles,
-    stencil: Stencil,
-    *,
-    total: bool,
+    loads: Sequence[AbstractLoad], laws: Sequence[AbstractLaw], particles: Particles, stencil: Stencil, *, total: bool
 ) -> tuple[LoadedPoints, ...]:
     """The points of each load of prepared particles at the start of a step."""
     d, dtype, F = particles.dim, particles.x.dtype, None

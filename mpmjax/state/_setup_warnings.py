@@ -21,6 +21,8 @@ from mpmjax.material import AbstractLaw
 from mpmjax.state._particles import Particles
 from mpmjax.state._scene import Scene
 
+Boundaries = tuple[AbstractBoundary, ...]
+
 _CROWDED = 1.25  # how many times the space that there is particles may take
 _MOST_BEYOND = 0.035
 """Part of all volume that may lie beyond that after a run: in a heap of sand it is up to 0.02; in water after a splash
@@ -105,9 +107,7 @@ def _in_stencils(kernel: BSpline, grid: Grid, places: Array) -> Bool[np.ndarray,
     return reached.reshape(-1)
 
 
-def _warn_of_thinness(
-    which: str, boundary: tuple[AbstractBoundary, ...], grid: Grid, x: np.ndarray, half: np.ndarray
-) -> None:
+def _warn_of_thinness(which: str, boundary: Boundaries, grid: Grid, x: np.ndarray, half: np.ndarray) -> None:
     """Warn of a body of few cells across, but for directions in which a wall or plane lies beside it."""
     dx, lower, upper = float(grid.spacing), (x - half).min(axis=0), (x + half).max(axis=0)
     for axis in np.flatnonzero(~np.asarray(grid.periodic)):
@@ -218,12 +218,7 @@ def _ratios(laws: tuple[AbstractLaw, ...], particles: Particles) -> list[Float[A
 
 
 def _probe(
-    boundary: tuple[AbstractBoundary, ...],
-    grid: Grid,
-    x: ParticleVector,
-    volume: Array,
-    resting: tuple[bool, ...],
-    total: bool,
+    boundary: Boundaries, grid: Grid, x: ParticleVector, volume: Array, resting: tuple[bool, ...], total: bool
 ) -> tuple[list[Int[Array, ""] | None], list[Bool[Array, "n"] | None]]:
     """How many particles lie in each body at the start, in the updated description; and on which nodes each boundary
     acts that rests."""

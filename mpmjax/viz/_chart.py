@@ -19,6 +19,8 @@ from mpmjax.fitting import (
 )
 from mpmjax.io import replacing, save_figure
 
+Experiments = tuple[Experiment, ...]
+
 
 def draw_chart(comparison: WorkPrecision, path: Path) -> Path:
     """Error over seconds, a line for each method and grid.
@@ -66,10 +68,7 @@ _PROFILES_A_ROW = 3
 
 
 def write_fit(
-    outcome: FitResult | RefinedFit,
-    picture: Path,
-    measured: tuple[Experiment, ...] = (),
-    profiles: tuple[Profile, ...] = (),
+    outcome: FitResult | RefinedFit, picture: Path, measured: Experiments = (), profiles: tuple[Profile, ...] = ()
 ) -> Path:
     """Write the picture of a fit, and beside it its numbers as JSON, the path of which is returned.
 
@@ -105,7 +104,7 @@ def write_fit(
 def _draw(
     result: FitResult,
     path: Path,
-    measured: tuple[Experiment, ...],
+    measured: Experiments,
     profiles: tuple[Profile, ...],
     predictions: tuple[Prediction, ...],
 ) -> None:
@@ -186,10 +185,7 @@ def _draw_profile(axis: Any, profile: Profile) -> None:
 
 
 def _numbers(
-    result: FitResult,
-    measured: tuple[Experiment, ...],
-    profiles: tuple[Profile, ...],
-    predictions: tuple[Prediction, ...],
+    result: FitResult, measured: Experiments, profiles: tuple[Profile, ...], predictions: tuple[Prediction, ...]
 ) -> dict[str, Any]:
     """The numbers of a fit on one grid, see `write_fit`."""
     plain = ("chi_squared", "p_value", "degrees_of_freedom", "level", "converged", "interrupted")
