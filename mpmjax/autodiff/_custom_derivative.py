@@ -36,20 +36,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jax.dtypes import float0
 
-from mpmjax._jax import (
-    Primitive,
-    ShapedArray,
-    Tracer,
-    Zero,
-    instantiate_zeros,
-    is_divided,
-    is_undefined_primal,
-    lower_fun,
-    primitive_batchers,
-    primitive_jvps,
-    primitive_transposes,
-    register_lowering,
-)
+from mpmjax import _jax
 from mpmjax._types import Array
 from mpmjax.native import BACKENDS, AbstractBackend, backend
 
@@ -235,15 +222,15 @@ def _lowered(platform: str, ctx: Any, *arrays: Any, call: _Call) -> Any:
     """By the back end of a platform, or as written."""
 
     def values(*arrays: Array) -> list[Array]:
-        out = None if is_divided(ctx.module_context) else _by_kernel(backend(platform), arrays, call)
+        out = None if _jax.is_divided(ctx.module_context) else _by_kernel(backend(platform), arrays, call)
         return _values(*arrays, call=call, unroll=platform != "cpu") if out is None else out
 
-    return lower_fun(values, multiple_results=True)(ctx, *arrays)
+    return _jax.lower_fun(values, multiple_results=True)(ctx, *arrays)
 
 
-def _abstract(*arrays: ShapedArray, call: _Call) -> list[ShapedArray]:
+def _abstract(*arrays: _jax.ShapedArray, call: _Call) -> list[_jax.ShapedArray]:
     batch, members = call.of_member(arrays)
-    return [ShapedArray((*batch, *a.shape), a.dtype) for a in jax.tree.leaves(call.results(members))]
+    return [_jax.ShapedArray((*batch, *a.shape), a.dtype) for a in jax.tree.leaves(call.results(members))]
 
 
 def _batch(arrays: Sequence[Any], axes: Sequence[Any], *, call: _Call) -> tuple[list[Array], list[int | None]]:
@@ -254,13 +241,13 @@ def _batch(arrays: Sequence[Any], axes: Sequence[Any], *, call: _Call) -> tuple[
 
 
 def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, call: _Call) -> tuple[list[Any], list[Any]]:
-    moving = [type(t) is not Zero and t.dtype != float0 for t in tangents]
+    moving = [type(t) is not _jax.Zero and t.dtype != float0 for t in tangents]
     rule = call.function.jvp
     if rule is None:
         raise NotImplementedError(f"{call.function} has no derivative.")
     if not any(moving):
         out = _custom_p.bind(*primals, call=call)
-        return out, [Zero(jax.typeof(a).to_tangent_aval()) for a in out]
+        return out, [_jax.Zero(jax.typeof(a).to_tangent_aval()) for a in out]
 
     def changed(primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
         remaining = iter(tangents)
@@ -273,12 +260,12 @@ def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, call: _Call) -> tup
     for axes in call.mapped:
         changed = jax.vmap(changed, in_axes=(list(axes), [axis for axis, m in zip(axes, moving, strict=True) if m]))
     out, change = changed(list(primals), [t for t, m in zip(tangents, moving, strict=True) if m])
-    zeros = [Zero(jax.typeof(a).to_tangent_aval()) for a in out]
+    zeros = [_jax.Zero(jax.typeof(a).to_tangent_aval()) for a in out]
     return out, [zero if c is None else c for c, zero in zip(change, zeros, strict=True)]
 
 
 def _transpose(cotangents: Sequence[Any], *arrays: Any, call: _Call) -> list[Any]:
-    wanted = [is_undefined_primal(a) for a in arrays]
+    wanted = [_jax.is_undefined_primal(a) for a in arrays]
     rule = call.function.transpose
     if rule is None:
         raise NotImplementedError(f"{call.function} has no transpose.")
@@ -307,13 +294,13 @@ def _transpose(cotangents: Sequence[Any], *arrays: Any, call: _Call) -> list[Any
     for axes in call.mapped:
         pulled = over_axis(pulled, axes)
     single = len(cotangents) == 1
-    whole = [instantiate_zeros(c) if single else None if type(c) is Zero else c for c in cotangents]
+    whole = [_jax.instantiate_zeros(c) if single else None if type(c) is _jax.Zero else c for c in cotangents]
     fixed = [a for a, one in zip(arrays, wanted, strict=True) if not one]
     results = iter(pulled(whole, fixed))
     return [next(results) if one else None for one in wanted]
 
 
-_custom_p = Primitive("custom")
+_custom_p = _jax.Primitive("custom")
 _custom_p.multiple_results = True
 _compiled = jax.jit(_custom_p.bind, static_argnames="call")
 
@@ -325,10 +312,12 @@ def _run(*arrays: Array, call: _Call) -> list[Array]:
 
 
 _custom_p.def_abstract_eval(_abstract)
-primitive_jvps[_custom_p], primitive_transposes[_custom_p], primitive_batchers[_custom_p] = _jvp, _transpose, _batch
-register_lowering(_custom_p, partial(_lowered, "others"))
+_jax.primitive_jvps[_custom_p] = _jvp
+_jax.primitive_transposes[_custom_p] = _transpose
+_jax.primitive_batchers[_custom_p] = _batch
+_jax.register_lowering(_custom_p, partial(_lowered, "others"))
 for _platform in ("cpu", *(kernels.platform for kernels in BACKENDS)):
-    register_lowering(_custom_p, partial(_lowered, _platform), platform=_platform)
+    _jax.register_lowering(_custom_p, partial(_lowered, _platform), platform=_platform)
 
 
 def materialised(tree: Any) -> Any:
@@ -338,7 +327,7 @@ def materialised(tree: Any) -> Any:
     It is a call that does nothing, in place, and costs a microsecond. The derivatives' arrays are stored too.
     """
     leaves, structure = jax.tree.flatten(tree)
-    places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Tracer)]  # what is known is stored already
+    places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, _jax.Tracer)]  # what is known is stored already
     for i, array in zip(places, _stored(*(leaves[i] for i in places)), strict=True):
         leaves[i] = array
     return jax.tree.unflatten(structure, leaves)

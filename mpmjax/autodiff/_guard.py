@@ -16,16 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._jax import (
-    Primitive,
-    Zero,
-    instantiate_zeros,
-    lower_fun,
-    primitive_batchers,
-    primitive_jvps,
-    primitive_transposes,
-    register_lowering,
-)
+from mpmjax import _jax
 from mpmjax._types import Array, Float, Int
 
 
@@ -49,7 +40,7 @@ def guard(
     return eqx.combine(jax.tree.unflatten(structure, leaves), rest), signal
 
 
-_guard_p = Primitive("guard")
+_guard_p = _jax.Primitive("guard")
 _guard_p.multiple_results = True
 
 
@@ -93,7 +84,7 @@ def _compiled(*operands: Any, faults: tuple[str, ...], failure: str, derivative:
     return [*(jnp.where(raised, jnp.full_like(a, unusable(a.dtype)), a) for a in leaves), signal]
 
 
-register_lowering(_guard_p, lower_fun(_compiled, multiple_results=True))
+_jax.register_lowering(_guard_p, _jax.lower_fun(_compiled, multiple_results=True))
 
 
 def _differentiated(primals: Any, tangents: Any, *, derivative: bool, **parameters: Any) -> Any:
@@ -106,19 +97,19 @@ def _differentiated(primals: Any, tangents: Any, *, derivative: bool, **paramete
 def _guarded(changes: Any, fault: Any, **parameters: Any) -> list[Any]:
     """Tangents or cotangents of leaves and signal, guarded."""
     *leaves, signal = changes
-    places = [i for i, change in enumerate(leaves) if type(change) is not Zero]
+    places = [i for i, change in enumerate(leaves) if type(change) is not _jax.Zero]
     if not places:
         return [*leaves, signal]
-    *some, signal = _guard_p.bind(*(leaves[i] for i in places), instantiate_zeros(signal), fault, **parameters)
+    *some, signal = _guard_p.bind(*(leaves[i] for i in places), _jax.instantiate_zeros(signal), fault, **parameters)
     for i, change in zip(places, some, strict=True):
         leaves[i] = change
     return [*leaves, signal]
 
 
-primitive_jvps[_guard_p] = _differentiated
+_jax.primitive_jvps[_guard_p] = _differentiated
 
 
-primitive_transposes[_guard_p] = lambda cotangents, *operands, **parameters: [
+_jax.primitive_transposes[_guard_p] = lambda cotangents, *operands, **parameters: [
     *_guarded(cotangents, operands[-1], **parameters),
     None,
 ]
@@ -129,4 +120,4 @@ def _batched(operands: Any, axes: Any, **parameters: Any) -> tuple[list[Any], li
     return _guard_p.bind(*operands, **parameters), list(axes[:-1])
 
 
-primitive_batchers[_guard_p] = _batched
+_jax.primitive_batchers[_guard_p] = _batched

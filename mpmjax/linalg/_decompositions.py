@@ -6,21 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+import mpmjax.linalg._matrices as la
 from mpmjax._types import Array, Compliance, Float, Matrix
 from mpmjax.autodiff import custom_derivative
-from mpmjax.linalg._matrices import (
-    assemble,
-    cofactor,
-    cofactors,
-    determinant,
-    dot,
-    double_dot,
-    entries,
-    identity_like,
-    matmul,
-    trace,
-    transpose,
-)
 
 _SWEEPS = {1: 0, 2: 1, 3: 4}  # by dimension: in 2-D one rotation is the closed form; 3-D converges quadratically
 _NEWTON_STEPS = 30  # on the quartic of the 3-D rotation: halves the error at a double root, else squares it
@@ -55,7 +43,7 @@ def _jacobi(S: Matrix) -> tuple[Array, Matrix]:
     d = len(S)
 
     def sweep(_: Array | int, state: tuple[Matrix, Matrix]) -> tuple[Matrix, Matrix]:
-        A, V = map(entries, state)
+        A, V = map(la.entries, state)
         for p, q in pairs(d):
             gap, twice = A[q][q] - A[p][p], 2 * A[p][q]
             # the smaller of the two angles, below 45 degrees, with which sweeps converge; its quotient cancels nowhere
@@ -70,9 +58,9 @@ def _jacobi(S: Matrix) -> tuple[Array, Matrix]:
                 A[a][b], A[e][f] = cos * A[a][b] - sin * A[e][f], sin * A[a][b] + cos * A[e][f]
             for row in V:
                 row[p], row[q] = cos * row[p] - sin * row[q], sin * row[p] + cos * row[q]
-        return assemble(A), assemble(V)
+        return la.assemble(A), la.assemble(V)
 
-    A, V = jax.lax.fori_loop(0, _SWEEPS[d], sweep, (S, identity_like(S)))
+    A, V = jax.lax.fori_loop(0, _SWEEPS[d], sweep, (S, la.identity_like(S)))
     return jnp.stack([A[i, i] for i in range(d)]), V
 
 
@@ -115,7 +103,7 @@ def rotation(F: Matrix) -> Matrix:
 def _rotation_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matrix, Matrix]:
     (F,), (dF,) = primals, tangents
     R = rotation(F)
-    return R, rotation_differential(R, spin_compliance(matmul(transpose(R), F)), dF)
+    return R, rotation_differential(R, spin_compliance(la.matmul(la.transpose(R), F)), dF)
 
 
 def spin_compliance(S: Matrix) -> Compliance:
@@ -129,10 +117,10 @@ def spin_compliance(S: Matrix) -> Compliance:
         case 1:
             return jnp.zeros_like(S)
         case 2:
-            return (1 / trace(S))[None, None]
+            return (1 / la.trace(S))[None, None]
         case _:
-            system = trace(S) * identity_like(S) - S
-            return transpose(cofactor(system)) / determinant(system)
+            system = la.trace(S) * la.identity_like(S) - S
+            return la.transpose(la.cofactor(system)) / la.determinant(system)
 
 
 def rotation_differential(R: Matrix, compliance: Compliance, dF: Matrix) -> Matrix:
@@ -142,40 +130,40 @@ def rotation_differential(R: Matrix, compliance: Compliance, dF: Matrix) -> Matr
     if d == 1:
         return jnp.zeros_like(dF)
     if d == 2:
-        V, r = entries(matmul(transpose(R), dF)), entries(R)
+        V, r = la.entries(la.matmul(la.transpose(R), dF)), la.entries(R)
         omega = compliance[0, 0] * (V[1][0] - V[0][1])
-        return omega * assemble([[r[0][1], -r[0][0]], [r[1][1], -r[1][0]]])
+        return omega * la.assemble([[r[0][1], -r[0][0]], [r[1][1], -r[1][0]]])
     x, y, z = _spin(R, compliance, dF)
     zero = jnp.zeros_like(x)
-    return matmul(R, assemble([[zero, -z, y], [z, zero, -x], [-y, x, zero]]))
+    return la.matmul(R, la.assemble([[zero, -z, y], [z, zero, -x], [-y, x, zero]]))
 
 
 def _spin(R: Matrix, compliance: Compliance, dF: Matrix) -> tuple[Array, Array, Array]:
     """ω in 3-D."""
-    V = entries(matmul(transpose(R), dF))
+    V = la.entries(la.matmul(la.transpose(R), dF))
     v = (V[2][1] - V[1][2], V[0][2] - V[2][0], V[1][0] - V[0][1])
-    x, y, z = (dot(row, v) for row in entries(compliance))
+    x, y, z = (la.dot(row, v) for row in la.entries(compliance))
     return x, y, z
 
 
 def _rotation_2d(F: Matrix) -> Matrix:
-    (a, b), (c, d) = entries(F)
+    (a, b), (c, d) = la.entries(F)
     cos, sin = a + d, c - b
     unit = jnp.hypot(cos, sin)
     singular = unit == 0
     cos = jnp.where(singular, 1, cos) / jnp.where(singular, 1, unit)
     sin = sin / jnp.where(singular, 1, unit)
-    return assemble([[cos, -sin], [sin, cos]])
+    return la.assemble([[cos, -sin], [sin, cos]])
 
 
 @partial(custom_derivative, kernel="rotation", results=lambda F: F)
 def _rotation_3d(F: Matrix) -> Matrix:
-    size = jnp.sqrt(double_dot(F, F))
+    size = jnp.sqrt(la.double_dot(F, F))
     F = F / jnp.where(size == 0, 1, size)  # ‖F‖ = 1 from here on
     q = _dominant_quaternion(F, _largest_root(F))
     for _ in range(_POLISH_STEPS):
         R = _rotation_of(q)
-        x, y, z = _spin(R, spin_compliance(matmul(transpose(R), F)), F)
+        x, y, z = _spin(R, spin_compliance(la.matmul(la.transpose(R), F)), F)
         near = x * x + y * y + z * z < 0.1  # not where R is hardly determined
         a, b, c, d = q
         # the quaternion product of q with (0, ω)
@@ -186,8 +174,8 @@ def _rotation_3d(F: Matrix) -> Matrix:
 
 def _largest_root(F: Matrix) -> Array:
     """tr S for ‖F‖ = 1, by Newton's method from √3 ≥ tr S, from where it falls monotonically until rounding."""
-    cof = cofactor(F)
-    J, cof2 = determinant(F), double_dot(cof, cof)
+    cof = la.cofactor(F)
+    J, cof2 = la.determinant(F), la.double_dot(cof, cof)
 
     def step(_: Array, root: Array) -> Array:
         square = root * root - 1
@@ -201,7 +189,7 @@ def _largest_root(F: Matrix) -> Array:
 
 def _dominant_quaternion(F: Matrix, root: Array) -> list[Array]:
     """The unit quaternion that maximises tr(RᵀF) = qᵀ K q: the largest column of adj(K − λI), λ the largest root."""
-    t, f = trace(F), entries(F)
+    t, f = la.trace(F), la.entries(F)
     z = [f[2][1] - f[1][2], f[0][2] - f[2][0], f[1][0] - f[0][1]]
     K = [[t, *z], *([z[i], *(f[i][j] + f[j][i] - (t if i == j else 0) for j in range(3))] for i in range(3))]
     K = [[K[i][j] - (root if i == j else 0) for j in range(4)] for i in range(4)]
@@ -209,7 +197,7 @@ def _dominant_quaternion(F: Matrix, root: Array) -> list[Array]:
     def signed_minor(i: int, j: int) -> Array:
         rows, columns = ([k for k in range(4) if k != skip] for skip in (i, j))
         minor = [[K[r][c] for c in columns] for r in rows]
-        return (-1) ** (i + j) * dot(minor[0], cofactors(minor)[0])
+        return (-1) ** (i + j) * la.dot(minor[0], la.cofactors(minor)[0])
 
     # every column is a multiple of the eigenvector: the one of the largest entry is not made of rounding
     upper = {(i, j): signed_minor(i, j) for i in range(4) for j in range(i, 4)}
@@ -233,7 +221,7 @@ def _normalised(q: list[Array]) -> list[Array]:
 def _rotation_of(q: list[Array]) -> Matrix:
     """The rotation of a unit quaternion."""
     w, x, y, z = q
-    return assemble(
+    return la.assemble(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -256,9 +244,9 @@ def principal_frame(F: Matrix) -> tuple[Matrix, Array, Matrix]:
     F, U and V have shape (d, d, *batch), s has shape (d, *batch).
     """
     R = rotation(F)
-    S = matmul(transpose(R), F)
-    s, V = symmetric_eigen((S + transpose(S)) / 2)
-    return matmul(R, V), s, V
+    S = la.matmul(la.transpose(R), F)
+    s, V = symmetric_eigen((S + la.transpose(S)) / 2)
+    return la.matmul(R, V), s, V
 
 
 @principal_frame.defjvp

@@ -1,5 +1,6 @@
 """Surfaces that touch in a step: the faces of particles, before walls and colliders, and those of bodies."""
 
+from functools import partial
 from itertools import combinations
 
 import jax.numpy as jnp
@@ -79,20 +80,9 @@ def contacts_of_bodies(
     ]
 
     at = jnp.ones(()) if force_at is None else jnp.asarray(force_at)
-    return [
-        body_contact(
-            bodies[pair[0]],
-            bodies[pair[1]],
-            pair,
-            friction=friction,
-            order=scene.kernel.order,
-            grid=scene.grid,
-            images=images,
-            dt=dt,
-            share=jnp.where(at > 0, at, 1).astype(particles.x.dtype),
-        )
-        for pair in combinations(range(scene.grid.layers), 2)
-    ]
+    share = jnp.where(at > 0, at, 1).astype(particles.x.dtype)
+    between = partial(body_contact, friction=friction, order=scene.kernel.order, grid=scene.grid, images=images)
+    return [between(bodies[a], bodies[b], (a, b), dt=dt, share=share) for a, b in combinations(range(layers), 2)]
 
 
 def contact_moduli(scene: Scene, particles: Particles, materials: tuple[MaterialPoints, ...]) -> Float[Array, "p"]:

@@ -244,13 +244,8 @@ def with_boundaries(
     if scene.bodies is not None:
         images = mirror(scene.boundary, grid, window)
         contacts += contacts_of_bodies(scene, scene.bodies.friction, particles, potential, images, dt, force_at)
-    nodes = replace(
-        nodes,
-        conditions=conditions,
-        contacts=tuple(contacts),
-        walls=walls,
-        brought_by=(*brought_by, *[None] * (len(contacts) - len(brought_by))),
-    )
+    numbers = (*brought_by, *[None] * (len(contacts) - len(brought_by)))
+    nodes = replace(nodes, conditions=conditions, contacts=tuple(contacts), walls=walls, brought_by=numbers)
     return with_tied_columns(nodes) if walls else nodes
 
 
