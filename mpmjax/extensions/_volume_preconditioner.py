@@ -78,7 +78,7 @@ class VolumePreconditioner(AbstractPreconditioner):
         window = shape = averaged[0].average.shape
         if self.extent is not None:
             fits = len(self.extent) == len(window)
-            require(fits, f"VolumePreconditioner's extent needs {len(window)} numbers, one an axis, got {self.extent}.")
+            require(fits, f"VolumePreconditioner's extent needs one for each of {len(window)} axes, got {self.extent}.")
             shape = tuple(min(pair) for pair in zip(self.extent, window, strict=True))
         # how many nodes away B sees along an axis: as far as a hat and a spline of so many cells overlap
         half = math.ceil(1 + len(stiffness.stencil.basis.knots) / 2) - 1
