@@ -12,9 +12,10 @@ from helpers import assert_close, slow, thorough
 
 import mpmjax as mpm
 from mpmjax.boundary._contact import ConstrainedNodes
+from mpmjax.boundary._plane_contact import plane_contact
 from mpmjax.boundary._surface_contact import FlowContact
 from mpmjax.implicit import Projection
-from mpmjax.potential import Mirror, surface_image, with_one_mass
+from mpmjax.potential import Mirror, surface_image, wall_image, with_one_mass
 
 DX, G, WATER = 1 / 16, 10.0, 1e3
 LEFT, SLIP, STICKY = mpm.SeparatingCollider, mpm.SlipCollider, mpm.StickyCollider
@@ -158,6 +159,30 @@ def test_friction_and_gap_of_what_flows_are_relative_to_the_surface():
     share = np.minimum(1, limit / (np.asarray(mass) * np.linalg.norm(slip, axis=1)))
     assert 0 < share[share > 0].min() < share.max() == 1
     assert_close(change, -share[:, None] * slip, 1e-12)
+
+
+def test_a_plane_that_moves_is_one_at_rest_seen_by_somebody_who_moves():
+    """To what flows: how columns part from it, and how friction slows what slides along it."""
+    rng, grid, still = np.random.default_rng(0), mpm.Grid((6, 7), DX), jnp.zeros(2)
+    mass, (v, push) = jnp.asarray(rng.random(42)) + 0.1, jnp.asarray(rng.normal(size=(2, 42, 2)))
+    none = SimpleNamespace(mirror=Mirror(()))
+    of_all = SimpleNamespace(mass=mass, projection=Projection(jnp.ones((42, 2), bool)), free_normals=())
+    of_all.contacts, of_all.walls, of_all.potential = (), (), none
+
+    @jax.jit
+    def told(velocity):
+        window, moving = grid.window(jnp.zeros((1, 2))), jnp.broadcast_to(velocity, v.shape)
+        wall = wall_image(1, 2.3 * DX, 1, grid, window, 2, velocity=moving)
+        plane = plane_contact((wall,), (1,), 0.3, jnp.ones((42, 1)))
+        held = ConstrainedNodes(of_all, (plane.shut,), Mirror(()), of_all)
+        seen = v + velocity
+        return plane.gap_velocity(held, seen), plane.friction(held, plane.shut, push)(seen)
+
+    (gap, change), seen = told(still), told(jnp.asarray([0.3, 0.7]))
+    assert gap.min() < 0 < gap.max()
+    assert np.abs(change).max() > 1e-2
+    assert_close(seen[0], gap, 1e-12)
+    assert_close(seen[1], change, 1e-12)
 
 
 PLANE = mpm.HalfSpace((0.3, 0.31), (-0.6, 0.8))
