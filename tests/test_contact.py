@@ -1,6 +1,8 @@
 """Contact: walls that push but do not pull, and Coulomb friction."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,7 +13,14 @@ from helpers import QUICK, assert_close, explicit_limit, ids, slow, thorough
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary._contact import ConstrainedNodes, constrain, count_places, friction_change, friction_share
+from mpmjax.boundary._contact import (
+    AbstractContact,
+    ConstrainedNodes,
+    constrain,
+    count_places,
+    friction_change,
+    friction_share,
+)
 from mpmjax.boundary._plane_contact import column_weight
 from mpmjax.checks._values import canonical
 from mpmjax.implicit import Projection, no_solve
@@ -328,6 +337,41 @@ def test_along_the_edge_of_two_walls_friction_is_that_of_both(walls, law, name):
     assert push.min() > 0.05
     assert_close(-changes[0][0], 0.2 * push[0] + 0.3 * push[1], 2e-2)
     assert_close(changes[-1], changes[0], 1e-10)
+
+
+class Rubs(AbstractContact):
+    """Takes a part of the velocity, by a matrix."""
+
+    part: Any
+
+    def gap_velocity(self, held, v):
+        raise NotImplementedError
+
+    normal_impulse = gap_velocity
+
+    def friction(self, held, active, residual):
+        return lambda v: -v @ self.part
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_of_more_boundaries_than_directions_friction_is_the_mean_of_two_orders(d):
+    """The scene's and the reverse, of three in 2-D; in 3-D of all six. Two contacts of one boundary count as one, and
+    keep their order."""
+    parts = 0.4 * np.random.default_rng(0).random((4, d, d))
+    contacts, v = tuple(map(Rubs, parts)), np.random.default_rng(1).normal(size=(5, d))
+    nodes = SimpleNamespace(tied=(), loose=None, brought_by=(0, 1, 1, 2), contacts=contacts)
+    held = ConstrainedNodes(nodes, (jnp.ones(5, bool),) * 4, Mirror(()), nodes)
+    rubbed, changes = held.friction(jnp.asarray(v), jnp.zeros_like(v))
+    orders = [(0, 1, 2, 3), (3, 1, 2, 0)]
+    orders += [(0, 3, 1, 2), (1, 2, 0, 3), (1, 2, 3, 0), (3, 0, 1, 2)] if d == 3 else []
+    wanted = np.zeros((4, 5, d))
+    for order in orders:
+        left = v
+        for k in order:
+            wanted[k] -= left @ parts[k] / len(orders)
+            left = left - left @ parts[k]
+    assert_close(jnp.stack(changes), wanted, 1e-14)
+    assert_close(rubbed, v + wanted.sum(axis=0), 1e-14)
 
 
 class Searching(mpm.Explicit):
