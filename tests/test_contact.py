@@ -557,6 +557,31 @@ def test_either_of_two_opposite_walls_rubs(low, high):
     assert_close(-lost, mu * abs(push), 1e-12)
 
 
+class Rubbed(Searching):
+    """A step in which an inner stage has rubbed already."""
+
+    change: jax.Array
+
+    def advance(self, nodes, guess):
+        motion, info = super().advance(nodes, guess)
+        return dataclasses.replace(motion, velocity=motion.velocity + self.change, friction=self.change), info
+
+
+def test_friction_over_a_step_is_mu_times_its_push_whatever_an_inner_stage_took():
+    @jax.jit
+    def rubbed(part):
+        nodes = in_touch(FLOORS["mirrored"](0.3), rising=-0.1)
+        nodes = eqx.tree_at(lambda n: n.v, nodes, nodes.velocity.at[:, 0].add(5.0))
+        change = jnp.where(nodes.occupied, jnp.stack([-part, 0 * part]), 0)
+        new = update(nodes, Rubbed(change))
+        return new.motion.velocity, sum(new.friction)
+
+    (v, friction), none = rubbed(0.01), rubbed(0.0)
+    assert -5 < friction[:, 0].min() < -1e-3
+    assert_close(v, none[0], 1e-13)
+    assert_close(friction, none[1], 1e-13)
+
+
 class Stubborn(mpm.Explicit):
     """Nodes that a plane would have to pull where it holds them, and that enter it where it does not."""
 
