@@ -22,6 +22,7 @@ from mpmjax.boundary._contact import (
     friction_share,
 )
 from mpmjax.boundary._plane_contact import column_weight
+from mpmjax.boundary._surface_contact import SurfaceContact
 from mpmjax.checks._values import canonical
 from mpmjax.implicit import Projection, no_solve
 from mpmjax.potential import Mirror
@@ -516,7 +517,7 @@ def test_friction_after_a_stage_is_that_of_a_step_as_long(floor):
 def test_a_collider_that_moves_rubs_on_what_does_not_move_with_it():
     """And pushes no face that is more than a spacing before or behind its surface; one that comes nearer at w by
     1 + ρ w²/(λ + 2μ) as stiffly."""
-    motion = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.4, 0.0)))
+    motion = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.4, 0.5)))
     floor = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), motion, friction=0.3)
 
     @jax.jit
@@ -527,20 +528,22 @@ def test_a_collider_that_moves_rubs_on_what_does_not_move_with_it():
         (contact,) = nodes.contacts
         return held.friction(v, 0 * v)[0][:, 0] - speed, contact.near[0], contact.stiffness[0]
 
-    (faster, _, stiffness), (same, *_) = rubbed(0.0, -0.02 * DX), rubbed(0.4, -0.02 * DX)
+    (faster, *_), (same, *_) = rubbed(0.0, -0.02 * DX), rubbed(0.4, -0.02 * DX)
     assert faster.max() > 1e-3
     assert faster.min() == 0
     assert np.abs(same).max() < 1e-14
     gap = (np.asarray(in_a_block().x)[:, 1] - 0.25 * DX) - 1.3 * DX
     np.testing.assert_array_equal(rubbed(0.0, -1.3 * DX)[1], np.abs(gap) < DX)
-    for rising, share in ((5.0, 1.0), (-5.0, 1 + 1e3 * 5.0**2 / (LAW.lame_lambda + 2 * LAW.shear_modulus))):
-        assert_close(rubbed(0.0, -0.02 * DX, rising)[2], share * stiffness, 1e-12)
+    leaving, modulus = rubbed(0.0, -0.02 * DX, 5.0)[2], LAW.lame_lambda + 2 * LAW.shear_modulus
+    for rising in (0.5, 0.0, -5.0):
+        stiffness = rubbed(0.0, -0.02 * DX, rising)[2]
+        assert_close(stiffness, (1 + 1e3 * (0.5 - rising) ** 2 / modulus) * leaving, 1e-12)
 
 
 @pytest.mark.parametrize(("low", "high"), [(-9.0, 0.2 - 0.01 * DX), *thorough((0.01 * DX, 9.0))])
 def test_either_of_two_opposite_walls_rubs(low, high):
-    """With μ times the push of its springs."""
-    mu = 0.3
+    """With μ times the push of its springs. The bound of stable steps knows that both push what is near to both."""
+    mu, one = 0.3, jnp.ones(in_a_block().count)
 
     @jax.jit
     def slowed(low, high):
@@ -549,12 +552,16 @@ def test_either_of_two_opposite_walls_rubs(low, high):
         held = constrain(nodes, shut)
         v = jnp.zeros_like(nodes.velocity).at[:, 0].set(9.0)
         push = sum(c.spring_impulse(held, each)[:, 1].sum() for c, each in zip(nodes.contacts, shut, strict=True))
-        return nodes.mass @ (held.friction(v, 0 * v)[0] - v), push
+        rate = SurfaceContact.stability_rate(nodes.contacts, nodes.mass, one, 0 * one)
+        return nodes.mass @ (held.friction(v, 0 * v)[0] - v), push, rate, nodes.contacts[1].near.sum(axis=0)
 
-    (lost, across), push = slowed(low, high)
+    (lost, across), push, rate, walls = slowed(low, high)
     assert abs(push) > 0
     assert across == 0
     assert_close(-lost, mu * abs(push), 1e-12)
+    *_, both, number = slowed(0.03, 0.17)
+    assert_close(both / rate, np.asarray(number), 1e-12)
+    assert (walls.max(), number.min(), number.max()) == (1, 1, 2)
 
 
 class Rubbed(Searching):
