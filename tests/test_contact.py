@@ -788,6 +788,22 @@ def test_friction_on_a_surface_stops_slip_and_nothing_that_is_held():
     assert (np.asarray(change)[2] == 0).all()
 
 
+def test_a_plane_holds_a_column_while_a_third_of_the_faces_around_it_touch():
+    """Two of five do, of seven not."""
+    grid = mpm.Grid((12,), 0.1, origin=(-3,))
+
+    @jax.jit
+    def held(x):
+        particles = mpm.Particles(x[:, None], 0 * x[:, None], 50 + 0 * x, 0.05 + 0 * x)
+        scene = canonical(mpm.Scene(grid, LAW, boundary=mpm.ContactPlane(0, 0.0)), float)
+        start = mpm.prepare(scene, particles)
+        return start_nodes(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start)).contacts[0].shut
+
+    touching, before, away = 0.0249, 0.0264, 0.55  # the face is 0.025 m before the centre, and shut up to 0.001 m
+    assert held(jnp.asarray([touching] * 2 + [before] * 3 + [away] * 2)).all()
+    assert not held(jnp.asarray([touching] * 2 + [before] * 5)).any()
+
+
 def test_a_face_far_behind_a_contact_plane_is_held_whatever_is_beside_it():
     """One particle a fifth of a spacing behind it, its neighbours a tenth before it, all on the way down: it stops,
     though more than two thirds of the faces around it do not touch."""
