@@ -1,6 +1,7 @@
 """Bodies that touch: the gap between them, what they give each other, friction, derivatives, bad input."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -10,10 +11,11 @@ import pytest
 from helpers import assert_close, assert_files_hold, ids, slow, thorough
 
 import mpmjax as mpm
-from mpmjax.boundary import constrain
-from mpmjax.boundary._body_contact import Coupling, Patch
+from mpmjax.boundary import ConstrainedNodes, constrain
+from mpmjax.boundary._body_contact import BodyContact, Coupling, Patch
 from mpmjax.checks import canonical
-from mpmjax.potential import Displacement
+from mpmjax.implicit import Projection
+from mpmjax.potential import Displacement, Mirror
 from mpmjax.stepping import start_nodes
 
 LAW = mpm.NeoHookean(1e4, 0.3)
@@ -260,6 +262,46 @@ def test_bodies_that_touch_do_so_beside_a_clamp_too():
         across = jnp.where(free.all(axis=1).reshape(2, -1), (both * contact.normal).sum(axis=2), 0)
         assert abs(across).max() < 1e-12
     np.testing.assert_array_equal(*gaps)
+
+
+def test_springs_across_the_normal_hold_what_slips_by_less_than_friction_may_take():
+    """f = min(1, μ|g|/(w Δt))², with the slip's velocity w, where bodies press; none where they do not yet."""
+    speed = np.array([5.0, -5.0])  # of the upper body
+    contact, _ = touching(*stacked(gap=-0.05, speed=5.0, shift=0.3))
+    near, normal = np.asarray(contact.near), np.asarray(contact.normal)
+    slip = np.linalg.norm(speed - normal * (normal @ speed)[:, None], axis=1)[near]
+    grip = np.minimum(1, 0.3 * np.maximum(-contact.gap[near], 0) / (slip * 1e-3)) ** 2
+    assert ((grip > 0.01) & (grip < 0.9)).any()
+    assert_close(contact.grip[near], grip)
+
+
+def test_bodies_share_what_friction_may_take_beside_springs():
+    """Σ (μ k |g| − k f |s|) Δt in all where all slides, none where springs have taken more; each node in proportion to
+    what it has left, opposite on the bodies and along the slip."""
+    rng, m, dt, ones = np.random.default_rng(2), 9, 0.5, np.ones(9)
+    along, normal = np.array([0.8, -0.6]), np.tile([0.6, 0.8], (m, 1))
+    depth, stiffness, grip = rng.uniform(0.1, 2, m), rng.uniform(1, 2, m), rng.uniform(0.5, 1, m)
+    numbers = (jnp.asarray(a) for a in (-depth, ones > 0, normal, stiffness, grip))
+    contact = BodyContact(*numbers, 0.5, dt, 1.0, Patch(jnp.asarray(ones), (3, 3), (False, False)), (0, 1))
+    nodes = SimpleNamespace(mass=jnp.ones(2 * m), projection=Projection(jnp.ones((2 * m, 2), bool)))
+    stencil, still = a_stencil(), jnp.zeros((2 * m, 2))
+    nodes.potential = SimpleNamespace(mirror=Mirror(()), displaced=lambda u: Displacement(stencil, 2 * m, u))
+    nodes.per_mass = lambda impulse: impulse
+
+    @jax.jit
+    def rubbed(slip):
+        held = ConstrainedNodes(nodes, (contact.near,), Mirror(()), nodes, still.at[:m].set(slip * along))
+        return contact.friction(held, contact.near, still)(still.at[:m].set(1e3 * along))
+
+    for slip in (0.3, 0.9):
+        left = dt * stiffness * (0.5 * depth - grip * slip)
+        rest = np.maximum(left, 0)
+        assert (left.sum() > 0) == (slip == 0.3)
+        assert 0 < (left < 0).sum() < m
+        wanted = rest * max(left.sum(), 0) / rest.sum()
+        upper, lower = np.asarray(rubbed(slip)).reshape(2, m, 2)
+        assert_close(upper, -wanted[:, None] * along)
+        assert_close(lower, -upper)
 
 
 def slid(name, friction, *, steps, dt):

@@ -1,6 +1,8 @@
 """Contact: walls that push but do not pull, and Coulomb friction."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,8 +13,16 @@ from helpers import QUICK, assert_close, explicit_limit, ids, slow, thorough
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary._contact import ConstrainedNodes, constrain, count_places, friction_change, friction_share
+from mpmjax.boundary._contact import (
+    AbstractContact,
+    ConstrainedNodes,
+    constrain,
+    count_places,
+    friction_change,
+    friction_share,
+)
 from mpmjax.boundary._plane_contact import column_weight
+from mpmjax.boundary._surface_contact import SurfaceContact
 from mpmjax.checks._values import canonical
 from mpmjax.implicit import Projection, no_solve
 from mpmjax.potential import Mirror
@@ -330,6 +340,41 @@ def test_along_the_edge_of_two_walls_friction_is_that_of_both(walls, law, name):
     assert_close(changes[-1], changes[0], 1e-10)
 
 
+class Rubs(AbstractContact):
+    """Takes a part of the velocity, by a matrix."""
+
+    part: Any
+
+    def gap_velocity(self, held, v):
+        raise NotImplementedError
+
+    normal_impulse = gap_velocity
+
+    def friction(self, held, active, residual):
+        return lambda v: -v @ self.part
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_of_more_boundaries_than_directions_friction_is_the_mean_of_two_orders(d):
+    """The scene's and the reverse, of three in 2-D; in 3-D of all six. Two contacts of one boundary count as one, and
+    keep their order."""
+    parts = 0.4 * np.random.default_rng(0).random((4, d, d))
+    contacts, v = tuple(map(Rubs, parts)), np.random.default_rng(1).normal(size=(5, d))
+    nodes = SimpleNamespace(tied=(), loose=None, brought_by=(0, 1, 1, 2), contacts=contacts)
+    held = ConstrainedNodes(nodes, (jnp.ones(5, bool),) * 4, Mirror(()), nodes)
+    rubbed, changes = held.friction(jnp.asarray(v), jnp.zeros_like(v))
+    orders = [(0, 1, 2, 3), (3, 1, 2, 0)]
+    orders += [(0, 3, 1, 2), (1, 2, 0, 3), (1, 2, 3, 0), (3, 0, 1, 2)] if d == 3 else []
+    wanted = np.zeros((4, 5, d))
+    for order in orders:
+        left = v
+        for k in order:
+            wanted[k] -= left @ parts[k] / len(orders)
+            left = left - left @ parts[k]
+    assert_close(jnp.stack(changes), wanted, 1e-14)
+    assert_close(rubbed, v + wanted.sum(axis=0), 1e-14)
+
+
 class Searching(mpm.Explicit):
     """An explicit step that looks for its active set, where its guess is right at once too."""
 
@@ -472,7 +517,7 @@ def test_friction_after_a_stage_is_that_of_a_step_as_long(floor):
 def test_a_collider_that_moves_rubs_on_what_does_not_move_with_it():
     """And pushes no face that is more than a spacing before or behind its surface; one that comes nearer at w by
     1 + ρ w²/(λ + 2μ) as stiffly."""
-    motion = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.4, 0.0)))
+    motion = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.4, 0.5)))
     floor = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), motion, friction=0.3)
 
     @jax.jit
@@ -483,20 +528,22 @@ def test_a_collider_that_moves_rubs_on_what_does_not_move_with_it():
         (contact,) = nodes.contacts
         return held.friction(v, 0 * v)[0][:, 0] - speed, contact.near[0], contact.stiffness[0]
 
-    (faster, _, stiffness), (same, *_) = rubbed(0.0, -0.02 * DX), rubbed(0.4, -0.02 * DX)
+    (faster, *_), (same, *_) = rubbed(0.0, -0.02 * DX), rubbed(0.4, -0.02 * DX)
     assert faster.max() > 1e-3
     assert faster.min() == 0
     assert np.abs(same).max() < 1e-14
     gap = (np.asarray(in_a_block().x)[:, 1] - 0.25 * DX) - 1.3 * DX
     np.testing.assert_array_equal(rubbed(0.0, -1.3 * DX)[1], np.abs(gap) < DX)
-    for rising, share in ((5.0, 1.0), (-5.0, 1 + 1e3 * 5.0**2 / (LAW.lame_lambda + 2 * LAW.shear_modulus))):
-        assert_close(rubbed(0.0, -0.02 * DX, rising)[2], share * stiffness, 1e-12)
+    leaving, modulus = rubbed(0.0, -0.02 * DX, 5.0)[2], LAW.lame_lambda + 2 * LAW.shear_modulus
+    for rising in (0.5, 0.0, -5.0):
+        stiffness = rubbed(0.0, -0.02 * DX, rising)[2]
+        assert_close(stiffness, (1 + 1e3 * (0.5 - rising) ** 2 / modulus) * leaving, 1e-12)
 
 
 @pytest.mark.parametrize(("low", "high"), [(-9.0, 0.2 - 0.01 * DX), *thorough((0.01 * DX, 9.0))])
 def test_either_of_two_opposite_walls_rubs(low, high):
-    """With μ times the push of its springs."""
-    mu = 0.3
+    """With μ times the push of its springs. The bound of stable steps knows that both push what is near to both."""
+    mu, one = 0.3, jnp.ones(in_a_block().count)
 
     @jax.jit
     def slowed(low, high):
@@ -505,12 +552,41 @@ def test_either_of_two_opposite_walls_rubs(low, high):
         held = constrain(nodes, shut)
         v = jnp.zeros_like(nodes.velocity).at[:, 0].set(9.0)
         push = sum(c.spring_impulse(held, each)[:, 1].sum() for c, each in zip(nodes.contacts, shut, strict=True))
-        return nodes.mass @ (held.friction(v, 0 * v)[0] - v), push
+        rate = SurfaceContact.stability_rate(nodes.contacts, nodes.mass, one, 0 * one)
+        return nodes.mass @ (held.friction(v, 0 * v)[0] - v), push, rate, nodes.contacts[1].near.sum(axis=0)
 
-    (lost, across), push = slowed(low, high)
+    (lost, across), push, rate, walls = slowed(low, high)
     assert abs(push) > 0
     assert across == 0
     assert_close(-lost, mu * abs(push), 1e-12)
+    *_, both, number = slowed(0.03, 0.17)
+    assert_close(both / rate, np.asarray(number), 1e-12)
+    assert (walls.max(), number.min(), number.max()) == (1, 1, 2)
+
+
+class Rubbed(Searching):
+    """A step in which an inner stage has rubbed already."""
+
+    change: jax.Array
+
+    def advance(self, nodes, guess):
+        motion, info = super().advance(nodes, guess)
+        return dataclasses.replace(motion, velocity=motion.velocity + self.change, friction=self.change), info
+
+
+def test_friction_over_a_step_is_mu_times_its_push_whatever_an_inner_stage_took():
+    @jax.jit
+    def rubbed(part):
+        nodes = in_touch(FLOORS["mirrored"](0.3), rising=-0.1)
+        nodes = eqx.tree_at(lambda n: n.v, nodes, nodes.velocity.at[:, 0].add(5.0))
+        change = jnp.where(nodes.occupied, jnp.stack([-part, 0 * part]), 0)
+        new = update(nodes, Rubbed(change))
+        return new.motion.velocity, sum(new.friction)
+
+    (v, friction), none = rubbed(0.01), rubbed(0.0)
+    assert -5 < friction[:, 0].min() < -1e-3
+    assert_close(v, none[0], 1e-13)
+    assert_close(friction, none[1], 1e-13)
 
 
 class Stubborn(mpm.Explicit):
@@ -710,6 +786,22 @@ def test_friction_on_a_surface_stops_slip_and_nothing_that_is_held():
         slip = along * (along @ (V[k] - moving[k])) / np.linalg.norm(along)
         np.testing.assert_allclose(change[k], -0.05 / 2 * slip / np.linalg.norm(slip), atol=1e-15)
     assert (np.asarray(change)[2] == 0).all()
+
+
+def test_a_plane_holds_a_column_while_a_third_of_the_faces_around_it_touch():
+    """Two of five do, of seven not."""
+    grid = mpm.Grid((12,), 0.1, origin=(-3,))
+
+    @jax.jit
+    def held(x):
+        particles = mpm.Particles(x[:, None], 0 * x[:, None], 50 + 0 * x, 0.05 + 0 * x)
+        scene = canonical(mpm.Scene(grid, LAW, boundary=mpm.ContactPlane(0, 0.0)), float)
+        start = mpm.prepare(scene, particles)
+        return start_nodes(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start)).contacts[0].shut
+
+    touching, before, away = 0.0249, 0.0264, 0.55  # the face is 0.025 m before the centre, and shut up to 0.001 m
+    assert held(jnp.asarray([touching] * 2 + [before] * 3 + [away] * 2)).all()
+    assert not held(jnp.asarray([touching] * 2 + [before] * 5)).any()
 
 
 def test_a_face_far_behind_a_contact_plane_is_held_whatever_is_beside_it():

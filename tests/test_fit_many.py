@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from helpers import assert_close
 from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
@@ -69,6 +70,12 @@ def test_a_curved_valley_is_followed_and_what_fails_is_not_taken(optimiser, near
     assert found.converged
     assert np.abs(np.asarray(found.z) - 2).max() < near
     assert np.diff([iteration.cost for iteration in found.history]).max() <= 1e-9
+
+
+def test_next_to_nothing_is_less_than_the_square_of_rtol_standard_errors():
+    """Their number squared, times σ²; that is Σ r² here, where a fit has no degree of freedom but one."""
+    end = search(Valley(2), mpm.fitting.LBFGS(rtol=0.1, max_steps=2), jnp.zeros(2))
+    assert_close(end.inner.decrease_tolerance, np.asarray(0.1**2 * 2 * end.history[-2].cost))
 
 
 def test_a_start_that_fails_says_so_and_no_derivative_is_an_error():

@@ -12,9 +12,12 @@ from helpers import assert_close, slow, thorough
 
 import mpmjax as mpm
 from mpmjax.boundary._contact import ConstrainedNodes
+from mpmjax.boundary._plane_contact import plane_contact
 from mpmjax.boundary._surface_contact import FlowContact
+from mpmjax.checks import canonical
 from mpmjax.implicit import Projection
-from mpmjax.potential import Mirror, surface_image, with_one_mass
+from mpmjax.potential import Mirror, surface_image, wall_image, with_one_mass
+from mpmjax.stepping import start_nodes
 
 DX, G, WATER = 1 / 16, 10.0, 1e3
 LEFT, SLIP, STICKY = mpm.SeparatingCollider, mpm.SlipCollider, mpm.StickyCollider
@@ -158,6 +161,70 @@ def test_friction_and_gap_of_what_flows_are_relative_to_the_surface():
     share = np.minimum(1, limit / (np.asarray(mass) * np.linalg.norm(slip, axis=1)))
     assert 0 < share[share > 0].min() < share.max() == 1
     assert_close(change, -share[:, None] * slip, 1e-12)
+
+
+def test_a_plane_that_moves_is_one_at_rest_seen_by_somebody_who_moves():
+    """To what flows: how columns part from it, and how friction slows what slides along it. No column closes around
+    which nothing touches."""
+    rng, grid, still = np.random.default_rng(0), mpm.Grid((6, 7), DX), jnp.zeros(2)
+    mass, (v, push) = jnp.asarray(rng.random(42)) + 0.1, jnp.asarray(rng.normal(size=(2, 42, 2)))
+    none = SimpleNamespace(mirror=Mirror(()))
+    of_all = SimpleNamespace(mass=mass, projection=Projection(jnp.ones((42, 2), bool)), free_normals=())
+    of_all.contacts, of_all.walls, of_all.potential = (), (), none
+
+    @jax.jit
+    def told(velocity):
+        window, moving = grid.window(jnp.zeros((1, 2))), jnp.broadcast_to(velocity, v.shape)
+        wall = wall_image(1, 2.3 * DX, 1, grid, window, 2, velocity=moving)
+        plane = plane_contact((wall,), (1,), 0.3, jnp.repeat(jnp.asarray([0.0, 1.0]), 21)[:, None])
+        held = ConstrainedNodes(of_all, (plane.shut,), Mirror(()), of_all)
+        seen = v + velocity
+        return plane.gap_velocity(held, seen), plane.friction(held, plane.shut, push)(seen)
+
+    (gap, change), seen = told(still), told(jnp.asarray([0.3, 0.7]))
+    assert gap.min() < 0 < gap.max()
+    assert not gap[:, :3].any()
+    assert np.abs(change).max() > 1e-2
+    assert_close(seen[0], gap, 1e-12)
+    assert_close(seen[1], change, 1e-12)
+
+
+def test_what_flows_is_held_by_where_a_collider_that_moves_is_at_the_start_of_a_step():
+    """From a gap of a hundredth of a spacing, whether it comes or goes; its springs push where it is at the end.
+    Its plane has its velocity."""
+    grid = mpm.Grid((12,), 0.1, origin=(-3,))
+
+    @jax.jit
+    def started(gap, way):
+        x, one = gap + jnp.asarray([0.025, 0.525]), jnp.ones(2)
+        floor = LEFT(mpm.HalfSpace((0.0,), (1.0,)), mpm.Motion((0.0, 1.0), jnp.stack([0 * way, way])[:, None]))
+        scene = canonical(mpm.Scene(grid, mpm.Fluid(1e4), boundary=floor), float)
+        start = mpm.prepare(scene, mpm.Particles(x[:, None], jnp.zeros((2, 1)), 50 * one, 0.05 * one))
+        stencil, dt = scene.stencil(start), jnp.asarray(1e-3)
+        springs, *_, plane = start_nodes(scene, start, jnp.zeros(()), dt, stencil, force_at=1.0).contacts
+        return plane.shut.any(), springs.gap[0, 0], plane.walls[0].velocity
+
+    for gap in (0.9e-3, 1.1e-3):
+        for way in (2.0, -2.0):
+            shut, at_end, velocity = started(gap, way)
+            assert shut == (gap < 1e-3)
+            assert_close(at_end, np.asarray(gap - way * 1e-3), 1e-12)
+            assert_close(velocity, np.full((12, 1), way))
+
+
+def test_springs_push_what_went_through_a_map():
+    """Of what flows, that whose centre is a tenth of a spacing behind a curved surface; by nothing else
+    in an explicit step."""
+    grid, places = mpm.Grid((12,), 0.1, origin=(-3,)), jnp.asarray([-0.011, -0.009, 0.02, 0.5])
+
+    @eqx.filter_jit
+    def pushed(shape):
+        particles = mpm.Particles(places[:, None], jnp.zeros((4, 1)), 50 * jnp.ones(4), 0.05 * jnp.ones(4))
+        scene = canonical(mpm.Scene(grid, mpm.Fluid(1e4), boundary=LEFT(shape)), float)
+        start = mpm.prepare(scene, particles)
+        return start_nodes(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start)).contacts[0].near[0]
+
+    np.testing.assert_array_equal(pushed(mpm.Ball((-1.0,), 1.0)), [True, False, False, False])
 
 
 PLANE = mpm.HalfSpace((0.3, 0.31), (-0.6, 0.8))

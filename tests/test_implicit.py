@@ -15,6 +15,7 @@ from numpy_oracle import grid_update, stress
 import mpmjax as mpm
 from mpmjax._types import Array
 from mpmjax.implicit import ImplicitOperator, Projection, SolveInfo, StageProblem, no_solve, solve
+from mpmjax.implicit._solver import solve_linear
 from mpmjax.implicit._stage import MOST_HALVINGS, backtrack
 
 TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
@@ -528,6 +529,7 @@ ENDS = {
         (0.9999, 2, 31, False, False),
     ),
     "rounding, uphill": ((HILL, (0.5, 2.0), LARGE, 1 + 1e-4, EXACT, True, True), (2, 30, 269, False, False)),
+    "where E vanishes but for rounding": ((PARABOLA, ANY, 1.0, 1 - 1e-9, 1e-12, True, False), (1, 1, 0, True, False)),
     "nothing beyond is admitted": ((PARABOLA, (0.0, 0.5), 5.0, 0.5, 1e-9, True, True), (0.5, 1, 30, False, False)),
     "nor is it, within ten times": ((PARABOLA, (0.0, 0.5), 5.0, 0.5, 0.0501, True, True), (0.5, 1, 30, False, True)),
     "nor is it, beyond that": ((PARABOLA, (0.0, 0.5), 5.0, 0.5, 0.0499, True, True), (0.5, 1, 30, False, False)),
@@ -553,6 +555,18 @@ def test_newton_ends_at_a_solution_or_says_that_it_does_not(name):
         slope = np.polyder(given[0])
         size = max(abs(slope[-1]), given[2])
         np.testing.assert_allclose(residual, abs(np.polyval(slope, float(found[0]))) / size, rtol=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_another_solver_tells_whether_it_met_negative_curvature(sign):
+    """By the solution: bᵀA⁻¹b < 0."""
+    operator = Curvature(jnp.ones(1), 1.0, jnp.diag(jnp.asarray([3.0, sign])), Projection(jnp.ones((1, 2), bool)))
+    inner = mpm.implicit.DiagonalInnerProduct(jnp.asarray([[2.0, 0.5]]))
+    for rhs, negative in (([[1.0, 3.0]], sign < 0), ([[3.0, 1.0]], False)):
+        x, info, _ = solve_linear(lx.LU(), operator, jnp.asarray(rhs), inner)
+        assert_close(x, np.asarray(rhs) / [3.0, sign])
+        assert info.indefinite == negative
+        assert info.converged
 
 
 class Sliding(StageProblem):

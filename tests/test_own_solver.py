@@ -229,6 +229,7 @@ class Missing(MinimalResidual):
 
     share: float = 0.0
     says: bool = True
+    atol: float | None = None
 
     def compute(self, state, vector, options):
         x = jnp.linalg.solve(state.as_matrix(), vector.reshape(-1)).reshape(vector.shape)
@@ -237,7 +238,8 @@ class Missing(MinimalResidual):
 
 
 def test_another_solver_has_converged_if_it_says_so_and_its_residual_does():
-    """Nearly within ten times its tolerance, whatever it says; and so Newton's method after its last step."""
+    """Nearly within ten times its tolerance, whatever it says; and so Newton's method after its last step. An absolute
+    tolerance is of each component, of a right-hand side of norm one."""
     scene, particles = block(1, material=LAWS["neo_hookean"])
     particles = mpm.prepare(scene, particles)  # stretched by a half, and at rest
     particles = dataclasses.replace(particles, deformations=(1.5 * particles.F,))
@@ -256,6 +258,9 @@ def test_another_solver_has_converged_if_it_says_so_and_its_residual_does():
         *verdict, residual = ended(mpm.SemiImplicit(solver=Missing(1e-6, times * 1e-6, says)))
         assert tuple(verdict) == wanted
         assert residual == pytest.approx(times * 1e-6)
+    both = 1e-6 + 3e-7 * np.sqrt(scene.grid.size)
+    for times, wanted in ((0.99, (True, False)), (1.01, (False, True))):
+        assert ended(mpm.SemiImplicit(solver=Missing(1e-6, times * both, atol=3e-7)))[:2] == wanted
     newton = lambda rtol: ended(mpm.BackwardEuler(mpm.implicit.Newton(rtol=rtol, max_steps=1)))  # noqa: E731
     left = newton(1e-9)[2]
     for times, wanted in ((0.9, (True, False)), (1.1, (False, True)), (9.9, (False, True)), (10.1, (False, False))):

@@ -24,9 +24,9 @@ from helpers import (
 
 import mpmjax as mpm
 from mpmjax.simulation import _simulate
-from mpmjax.simulation._diffrax import Problem, faulty_particles
-from mpmjax.simulation._faults import advise, disallowed
-from mpmjax.simulation._run import Fault
+from mpmjax.simulation._diffrax import Problem, faulty_particles, initial_state, run_to
+from mpmjax.simulation._faults import advise, disallowed, raise_faults
+from mpmjax.simulation._run import Fault, no_steps
 from mpmjax.state import state_of
 
 DT = 5e-3
@@ -210,6 +210,18 @@ def test_a_particle_that_leaves_the_window_is_named():
     assert "Enlarge the grid's shape, or use follow=True." in str(caught.value)
     assert "limit" not in str(caught.value)  # dt is far below it
     assert_close(caught.value.run.final.x[1, 0], 0.5 + 35 * 0.0099, 1e-12)
+
+
+def test_a_particle_that_a_moving_grid_leaves_behind_is_named():
+    """By where the window is at the end of the step: with its plane it goes 0.1 m a step down, from 0.85 m."""
+    grid, away = mpm.Grid((12,), 0.1, origin=(-2,)), mpm.Motion((0.0, 1.0), ((0.0,), (-10.0,)))
+    particles = mpm.Particles(jnp.array([[0.2], [0.5]]), jnp.zeros((2, 1)), jnp.ones(2), jnp.full(2, 1e-6))
+    scene = mpm.Scene(grid, LAWS["neo_hookean"], boundary=mpm.SymmetryPlane(0, 0.0, motion=away))
+    problem = Problem(scene, mpm.prepare(scene, particles), jnp.asarray(0.01), mpm.Explicit())
+    state, fault = initial_state(problem), {"fault": jnp.asarray(Fault.OUTSIDE), "fault_step": jnp.asarray(4)}
+    run = run_to(problem, state, 4, replace(no_steps(float), **fault))
+    with pytest.raises(mpm.SimulationError, match=r"At step 4 \(t = 0.04 s\) particle 1 left the grid's window"):
+        raise_faults(run, problem, lambda: state, 0)
 
 
 def breathing(law, d=2, **choices):
