@@ -647,6 +647,7 @@ NAMED = (
 )
 
 
+@pytest.mark.thorough
 def test_materials_may_have_names(tmp_path):
     """The same scene as by numbers; names are in the file, in what is said of it, and in dotted paths."""
     (tmp_path / "two.toml").write_text(TWO)

@@ -191,6 +191,7 @@ def test_controls_that_break_their_promise_are_refused(tmp_path):
             mpm.simulate(other, particles, t1=DT, dt=DT, control=Outlet(mpm.Box((0.0, 0.0), (0.1, 0.1))))
 
 
+@pytest.mark.thorough
 def test_fibres_pull_along_their_direction():
     """T (F a0) a0ᵀ/λ, a convex energy, and a bound of its tangent."""
     contracted = MUSCLE.elastic(MUSCLE.initial_history(jnp.ones((2, 2, 1))))
@@ -252,6 +253,7 @@ SCENES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("options", **ids(SCENES, "faces"))
 def test_particles_without_mass_change_nothing(options):
     """To rounding, in every transfer and kind of scene; nor the longest step, the energy and the momentum."""
@@ -354,6 +356,7 @@ def test_a_nozzle_lets_in_mass_as_fast_as_it_flows():
     assert (np.asarray(run.final.v)[out, 1] < 0).all()
 
 
+@pytest.mark.thorough
 def test_the_gradient_by_the_speed_of_a_nozzle_is_that_of_differences():
     def reached(speed):
         scene, inlet = jet(speed)

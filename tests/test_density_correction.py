@@ -142,7 +142,8 @@ def test_only_the_fluid_is_corrected_and_others_take_their_present_volume():
     assert float(new.deformations[1].min()) < 0.95
 
 
-@pytest.mark.parametrize("method", [mpm.Explicit(), *thorough(mpm.SemiImplicit())])
+@pytest.mark.thorough
+@pytest.mark.parametrize("method", [mpm.Explicit(), mpm.SemiImplicit()])
 def test_derivatives_of_a_correction_are_those_of_differences(method):
     scene, water = vessel(2, correction=DensityCorrection(room(2), rate=5.0), gravity=(0.0, -9.81))
     water = eqx.tree_at(lambda q: q.volume, water, 1.3 * water.volume)

@@ -61,6 +61,7 @@ def both():
     return fit(experiment(seen, n=2), {"E": STIFFNESS, "nu": RATIO}, report=shear)
 
 
+@pytest.mark.thorough
 def test_notebooks_show_the_table_and_the_picture_of_a_fit(both):
     assert mpm.render  # loads the room that gives the view, as a notebook does
     shown = both._repr_html_()

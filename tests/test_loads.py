@@ -188,7 +188,8 @@ def test_loads_have_the_force_and_moment_that_was_asked_for(description, d):
         assert_close(found[1], axial(np.outer(force, place)), 1e-9)
 
 
-@pytest.mark.parametrize("gradient", [mpm.MLSGradient(), *thorough(mpm.SplineGradient())])
+@pytest.mark.thorough
+@pytest.mark.parametrize("gradient", [mpm.MLSGradient(), mpm.SplineGradient()])
 def test_the_stress_next_to_a_pulled_end_is_that_of_the_bar(gradient):
     """Within 4.5 % at rest, wherever the end lies in a cell: by the particles at the end alone it is up to 50 % off."""
     settings = {"description": mpm.TotalLagrangian(), "gradient": gradient, "boundary": mpm.SymmetryPlane(0, 0.0)}
@@ -421,6 +422,7 @@ def test_loads_have_derivatives(d):
         assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / (2e-3 * number), rel=1e-4)
 
 
+@pytest.mark.thorough
 def test_loads_forces_and_planes_that_move_in_single_precision():
     """All together keep the particles' precision, explicit and implicit."""
     loads = mpm.Traction(TOP, RAMP), mpm.Pressure(RIGHT, 1.0), mpm.Spring(mpm.PointsAt(((0.1, 0.1),)), 1e3, 1.0)

@@ -68,6 +68,7 @@ def test_its_budget_closes():
     assert_close(found.momentum.explained, found.momentum.change, 1e-9, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_bound_on_the_step_is_given_or_said_to_be_missing():
     """In the total description it follows from where the particles are."""
     spline, mls, own = (

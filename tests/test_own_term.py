@@ -194,6 +194,7 @@ class BarredWall(HardeningSpring):
         return Barrier(points, self.stiffness * points.weight, self.wall)
 
 
+@pytest.mark.thorough
 def test_the_line_search_keeps_to_where_a_term_is_defined(tmp_path):
     """A block that would fly beyond the barrier in one step stops before it, in balance with it: the impulse of the
     barrier is what it has lost. A run with it comes back from a file."""

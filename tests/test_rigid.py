@@ -355,6 +355,7 @@ def test_compiled_the_nodes_of_a_body_that_rubs_move_as_they_do_uncompiled():
     assert_close(jax.jit(rub)(field), plain, 1e-12)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}, "explicit"))
 def test_derivatives_of_its_motion_are_those_of_differences(method):
     """By its mass, the forces on it, friction and the stiffness of what it falls on."""
@@ -407,6 +408,7 @@ def test_its_energy_is_that_of_a_rigid_body():
         assert float(at_start.kinetic) == pytest.approx(float(expected), rel=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_run_comes_back_from_its_file(tmp_path):
     scene, particles = pressed()
     at = mpm.PointsAt(((0.205, 0.22), (0.405, 0.37)))

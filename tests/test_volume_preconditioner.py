@@ -51,9 +51,10 @@ def matrices(operator, preconditioner):
     return [jax.vmap(f)(columns).reshape(columns.shape[0], -1) for f in maps]
 
 
-@pytest.mark.parametrize("d", [2, *thorough(3)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("description", **ids(DESCRIPTIONS, "updated"))
-@pytest.mark.parametrize("extent", [None, *thorough(3)])
+@pytest.mark.parametrize("extent", [None, 3])
 def test_it_is_symmetric_and_definite_and_its_inverse_is_one(extent, description, d):
     """In a box that is too small for the bodies too."""
     choice = mpm.extensions.VolumePreconditioner(extent=None if extent is None else (extent,) * d)

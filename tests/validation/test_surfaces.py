@@ -36,6 +36,7 @@ def whole_cells(cells, per_side=2):
     return mpm.Particles(x, jnp.zeros_like(x), RING.density * volume, volume)
 
 
+@pytest.mark.thorough
 def test_the_ring_is_free_of_traction_and_its_force_is_the_closed_form():
     """ν = 0: P_r = μ(λr − 1/λr), P_θ = μ(λθ − 1/λθ), b_r = ü − (P_r′ + (P_r − P_θ)/R)/ρ0."""
     mu, rho, c, t = 1e7 / 2, 1e3, 100.0, 0.0037
