@@ -93,7 +93,6 @@ def pushed(tmp_path_factory):
     return folder
 
 
-@pytest.mark.thorough
 def test_each_kind_predicts_what_was_measured_of_the_same_run(pushed):
     """And nothing else does: none is the same on another run. The curve is of half a body, pressed the other way."""
     (experiment,) = read_fit(pushed / "block.toml").experiments

@@ -84,7 +84,7 @@ class Pallet(mpm.AbstractMaterial):
         return jnp.broadcast_to(jnp.asarray(self.modulus, F.dtype), (1,))
 
 
-@pytest.mark.parametrize("name", thorough("semi_implicit", "explicit"))
+@pytest.mark.parametrize("name", ["semi_implicit", *thorough("explicit")])
 def test_a_body_moves_as_its_constraint_lets_it(name):
     """Pushed at a corner it has the acceleration of the force on its mass, and beside it a soft block falls freely."""
     grid, dt, steps = mpm.Grid((14, 12), 0.1, origin=(-3, -3)), 1e-3, 5

@@ -27,7 +27,6 @@ class Drag(mpm.state.AbstractLoad):
         return -self.density / 2 * self.coefficient * points.weight * speed * points.v
 
 
-@pytest.mark.thorough
 def test_a_load_of_ones_own_acts_and_is_kept_in_files(tmp_path):
     """It brakes a flying block by the drag on its four sides, and a run with it comes back from a file."""
     mpm.register(Drag)

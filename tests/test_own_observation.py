@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import mpmjax as mpm
 
@@ -31,7 +30,6 @@ def bar(stiffness):
     return mpm.Scene(grid, mpm.NeoHookean(stiffness, 0.3)), particles
 
 
-@pytest.mark.thorough
 def test_a_stiffness_is_fitted_to_an_observation_of_ones_own():
     """From a first guess that is 20 % off, to the stiffness of the run that was observed."""
     scene, particles = bar(7e4)

@@ -47,7 +47,6 @@ def test_it_finds_what_newton_finds_with_its_derivative(integrator):
     assert float(own) == pytest.approx(float(newton), rel=1e-6)
 
 
-@pytest.mark.thorough
 def test_its_budget_closes_and_it_is_saved(tmp_path):
     scene, particles = swinging()
     method = mpm.ImplicitMidpoint(solution=Chord())
