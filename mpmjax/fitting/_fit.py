@@ -143,7 +143,8 @@ def fit(
 
 
 def _see(problem: FitProblem, seen: Evaluation, alike: set[str]) -> None:
-    """Refuse parameters that the data do not see at the first guess; warn, once, of those not seen apart, `alike`."""
+    """Refuse parameters that the data do not see at the first guess; warn, once, of those not seen apart, `alike`, and
+    of data of the other sign."""
     rounding = _ROUNDINGS * float(problem.rounding_of_data())
     if seen.jacobian is None:
         # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.
@@ -159,6 +160,12 @@ def _see(problem: FitProblem, seen: Evaluation, alike: set[str]) -> None:
         f"The data do not depend on {shortened(', '.join(unseen))}: their derivative by it is zero but for "
         "rounding. Leave it out, give it a prior, or observe what it changes.",
     )
+    for o, rows, sigma in zip(problem.observations, problem.rows, problem.sigmas, strict=True):
+        if seen.residuals is not None and o.robust is None:
+            data = -np.asarray(o.residuals(jnp.zeros(o.data.shape, problem.dtype), sigma))
+            computed = np.asarray(seen.residuals)[rows] + data
+            if computed @ data < -_OPPOSITE * np.linalg.norm(computed) * np.linalg.norm(data):
+                warn(f"At the first guess, {o.name} is computed with the sign opposite to the data's. {_TURN}")
     if seen.jacobian is None or alike:
         return
     errors = uncertainty(np.asarray(seen.jacobian, float), float(jnp.finfo(problem.dtype).eps), ())
@@ -348,3 +355,5 @@ def fit_ensemble(
 MOST_COLUMNS = 32  # of a Jacobian, or rows at what they cost more, up to which Levenberg-Marquardt is the cheaper
 MOST_ROUNDS = 20  # most re-estimations of the noise
 _ROUNDINGS = 10  # derivatives by a coordinate below so many roundings of the data are none
+_OPPOSITE = 0.9  # cosine of the angle between computed and measured numbers beyond which their sign is another
+_TURN = "Turn the data (scale = -1 in a scene file), if it is not the guess that is to turn."
