@@ -23,8 +23,10 @@ _HOMES = {
 
 def __getattr__(name: str):
     if name not in _HOMES:
-        rooms = () if name.startswith("_") else ("geometry", "fitting", "implicit", "extensions", "analysis")
-        there = "".join(f"; mpm.{r}.{name} is one" for r in rooms if hasattr(_import_module(f"{__name__}.{r}"), name))
+        # read, not imported: whoever asks whether there is a name does not load JAX
+        rooms = {r: _Path(__file__).with_name(r) for r, home in _HOMES.items() if home == f"{__name__}.{r}"}
+        homes = [r for r, at in rooms.items() if f" {name} as {name}" in (at / "__init__.py").read_text("utf-8")]
+        there = "".join(f"; mpm.{room}.{name} is one" for room in homes)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{there}")
     module = _import_module(_HOMES[name])
     globals()[name] = module if module.__name__ == f"{__name__}.{name}" else getattr(module, name)

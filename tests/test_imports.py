@@ -119,6 +119,8 @@ def test_a_name_of_a_room_is_not_found_at_the_top_and_says_where_it_is():
         mpm.Union  # noqa: B018
     with pytest.raises(AttributeError, match=r"no attribute 'Onion'$"):
         mpm.Onion  # noqa: B018
+    code = "import mpmjax, sys; hasattr(mpmjax, 'Union'); sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_importing_changes_no_configuration_and_computes_nothing():

@@ -143,8 +143,8 @@ def fit(
 
 
 def _see(problem: FitProblem, seen: Evaluation, alike: set[str]) -> None:
-    """Refuse parameters that the data do not see at the first guess; warn, once, of those not seen apart, `alike`, and
-    of data of the other sign."""
+    """Refuse parameters that the data do not see at the first guess; warn of data of the other sign and, once, of
+    parameters not seen apart, `alike`."""
     rounding = _ROUNDINGS * float(problem.rounding_of_data())
     if seen.jacobian is None:
         # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.
@@ -160,18 +160,27 @@ def _see(problem: FitProblem, seen: Evaluation, alike: set[str]) -> None:
         f"The data do not depend on {shortened(', '.join(unseen))}: their derivative by it is zero but for "
         "rounding. Leave it out, give it a prior, or observe what it changes.",
     )
-    for o, rows, sigma in zip(problem.observations, problem.rows, problem.sigmas, strict=True):
-        if seen.residuals is not None and o.robust is None:
-            data = -np.asarray(o.residuals(jnp.zeros(o.data.shape, problem.dtype), sigma))
-            computed = np.asarray(seen.residuals)[rows] + data
-            if computed @ data < -_OPPOSITE * np.linalg.norm(computed) * np.linalg.norm(data):
-                warn(f"At the first guess, {o.name} is computed with the sign opposite to the data's. {_TURN}")
+    if seen.residuals is not None:
+        _warn_of_signs(problem, np.asarray(seen.residuals))
     if seen.jacobian is None or alike:
         return
     errors = uncertainty(np.asarray(seen.jacobian, float), float(jnp.finfo(problem.dtype).eps), ())
     for text in seen_together(problem.labels, errors, problem.logarithmic):
         alike.add(text.split(":")[0])
         warn(f"At the first guess, {text}")
+
+
+def _warn_of_signs(problem: FitProblem, residuals: np.ndarray) -> None:
+    """Warn of observations that the first guess computes with the sign opposite to the data's: there is no fit of a
+    modulus to them but zero. Those with a robust loss, which bends residuals, are left out."""
+    for o, rows, sigma in zip(problem.observations, problem.rows, problem.sigmas, strict=True):
+        data = -np.asarray(o.residuals(jnp.zeros(o.data.shape, problem.dtype), sigma))
+        computed = residuals[rows] + data
+        if o.robust is None and computed @ data < -_OPPOSITE * np.linalg.norm(computed) * np.linalg.norm(data):
+            warn(
+                f"At the first guess, {o.name} is computed with the sign opposite to the data's. Turn the data "
+                "(scale = -1 in a scene file), if it is not the guess that is to turn."
+            )
 
 
 def _warn_of(result: FitResult, end: Search, *, moves: bool, but: set[str]) -> None:
@@ -356,4 +365,3 @@ MOST_COLUMNS = 32  # of a Jacobian, or rows at what they cost more, up to which 
 MOST_ROUNDS = 20  # most re-estimations of the noise
 _ROUNDINGS = 10  # derivatives by a coordinate below so many roundings of the data are none
 _OPPOSITE = 0.9  # cosine of the angle between computed and measured numbers beyond which their sign is another
-_TURN = "Turn the data (scale = -1 in a scene file), if it is not the guess that is to turn."
