@@ -49,16 +49,15 @@ def step_of(width, method, boundary):
 @pytest.mark.parametrize(
     ("method", "boundary", "width", "files", "functions"),
     [
-        pytest.param(mpm.Explicit(), (), 0.55, 18, 77, id="explicit free"),
+        pytest.param(mpm.Explicit(), (), 0.55, 18, 78, id="explicit free"),
         pytest.param(mpm.SemiImplicit(), mpm.SlipBox((0.0, 0.0), (0.8, 0.8)), 0.65, 27, 142, id="semi-implicit slip"),
         pytest.param(
-            mpm.SemiImplicit(), mpm.SeparatingBox((0.0, 0.0), (0.8, 0.8)), 0.75, 34, 207, id="semi-implicit separating"
+            mpm.SemiImplicit(), mpm.SeparatingBox((0.0, 0.0), (0.8, 0.8)), 0.75, 34, 200, id="semi-implicit separating"
         ),
     ],
 )
 def test_a_step_enters_what_its_scene_has(method, boundary, width, files, functions):
     """At most as many files and functions as written here."""
     seen = entered(*step_of(width, method, boundary))
-    assert (len({file for file, *_ in seen}), len(seen)) <= (files, functions)
     assert len({file for file, *_ in seen}) <= files
     assert len(seen) <= functions

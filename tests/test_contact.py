@@ -472,10 +472,8 @@ def test_there_is_no_friction_where_a_wall_would_have_to_pull():
     for boundary in (FLOORS["plain"](0.3), FLOORS["mirrored"](0.3), slope):
         for up in (-1.0, 1.0):
             nodes = in_touch(boundary, -up * 0.02 * DX if boundary.pushes else 0.0)
-            places = [
-                contact.likely_held(ConstrainedNodes(nodes, (), Mirror(()), nodes), nodes.velocity)
-                for contact in nodes.contacts
-            ]
+            nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes)
+            places = [contact.likely_held(nothing_held) for contact in nodes.contacts]
             held = constrain(nodes, tuple(jnp.ones_like(place) for place in places))
             v = jnp.zeros_like(nodes.velocity).at[:, 0].set(1.0)
             momentum_residual = up * nodes.mass[:, None] * jnp.asarray([0.0, 1.0])

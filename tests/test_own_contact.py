@@ -29,8 +29,8 @@ class GlueContact(mpm.boundary.AbstractContact):
     def gap_velocity(self, held, v):
         return self.column(self.inward * held.mass * v[:, self.axis])
 
-    def likely_held(self, held, v):
-        return self.gap_velocity(held, v) < self.bears
+    def likely_held(self, held):
+        return self.gap_velocity(held, held.nodes.explicit_velocity()) < self.bears
 
     def normal_impulse(self, held, residual):
         return self.column(self.inward * held.impulse(residual)[:, self.axis]) + self.bears
@@ -41,6 +41,7 @@ class GlueContact(mpm.boundary.AbstractContact):
     def fixed(self, active, shape):
         return (active & self.beyond)[:, None] & (jnp.arange(shape[1]) == self.axis)
 
+    @property
     def representative(self):
         first = jnp.arange(self.shape[self.axis]) == 0
         axes = [1] * len(self.shape)

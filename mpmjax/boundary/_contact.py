@@ -5,7 +5,7 @@ along a contact plane, of a contact of your own. Its gap g and normal impulse r 
 g is the velocity with which the gap opens, for faces and bodies the gap with its spring's length. The *active set* is
 the mask of the places that are held shut, one for each contact.
 
-It is guessed as the places that the start of the step, or the explicit velocity v*, closes. Then in sweeps: solve with
+It is guessed as the places that the velocity v^n, or the explicit v*, closes. Then in sweeps: solve with
 the active set held; release the places that would have to pull, hold those that are entered; stop when nothing changes,
 or `SWEEPS` sets were given up. The conditions that are violated by then are counted in `ContactInfo.violations`. The
 derivative is that of a solve with the last set held, and does not exist where the set changes. An explicit step's force
@@ -24,7 +24,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from itertools import groupby, permutations
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -57,9 +57,11 @@ class AbstractContact(eqx.Module):
     - `shape`: (n, d).
     """
 
-    def known_at_start(self, nodes: Any, explicit: bool) -> bool:
-        """Whether `likely_held` is the active set of a step, whose force is that at its start if it is explicit.
-        Default: it may not be."""
+    representative: ClassVar[Any] = None
+    """One node of each place, shape (n,), by which places are counted; None where each node is a place."""
+
+    def known_at_start(self, nodes: Any) -> bool:
+        """Whether `likely_held` is the active set of an explicit step. Default: it may not be."""
         return False
 
     def at(self, share: Scalar) -> "AbstractContact":
@@ -80,10 +82,10 @@ class AbstractContact(eqx.Module):
         """The impulse by which the boundary holds each place [kg m/s], shape (n,): below zero where it pulls, and so
         must let go. A boundary that can pull adds the most that it can pull with."""
 
-    def likely_held(self, held: "ConstrainedNodes", v: NodeVector) -> Bool[Array, "..."]:
-        """The places that are held in the first sweep, shape (n,), at the explicit velocity v*, with nothing held yet.
-        Default: those where the gap closes."""
-        return self.gap_velocity(held, v) < 0
+    def likely_held(self, held: "ConstrainedNodes") -> Bool[Array, "..."]:
+        """The places that are held in the first sweep, shape (n,), with nothing held yet. Default: those where the gap
+        closes at the explicit velocity v*."""
+        return self.gap_velocity(held, held.nodes.explicit_velocity()) < 0
 
     def rounding(self, held: "ConstrainedNodes", noise: Array) -> tuple[Array, Array]:
         """How far the gap velocity and the normal impulse may lie below zero by rounding, each (n,) or a number, at the
@@ -128,10 +130,6 @@ class AbstractContact(eqx.Module):
         """
         return 0.0
 
-    def representative(self) -> Bool[Array, "n"] | None:
-        """One node of each place, shape (n,), by which places are counted; None where each node is a place."""
-        return None
-
 
 class AbstractSpringContact(AbstractContact):
     """Contact by springs on gaps, ½ k min(g, 0)² at each place (see `Springs` and `Coupling`).
@@ -149,8 +147,12 @@ class AbstractSpringContact(AbstractContact):
     share: eqx.AbstractVar[Scalar]  # θ; 1 where forces are those at the start of the step
     near: eqx.AbstractVar[Array]  # whether a place may touch in this step, in the same shape
 
-    def known_at_start(self, nodes: Any, explicit: bool) -> bool:
-        return explicit
+    def known_at_start(self, nodes: Any) -> bool:
+        return True
+
+    def likely_held(self, held: "ConstrainedNodes") -> Array:
+        """The places whose gap is below zero at the displacement of `held`."""
+        return self.spring_gap(held) < 0
 
     @abc.abstractmethod
     def spread(self, stretch: Array, stiffness: Array) -> AbstractSpring:
@@ -241,10 +243,11 @@ class ConstrainedNodes(eqx.Module):
 
     def without_spring_impulses(self, residual: NodeVector) -> NodeVector:
         """The part of the residual that holds components of velocity."""
-        for contact, active in zip(self.unconstrained.contacts, self.active, strict=True):
-            impulse = contact.spring_impulse(self, active)
-            residual = residual if impulse is None else residual - self.unconstrained.potential.mirror.fold(impulse)
-        return residual
+        nodes, pairs = self.unconstrained, zip(self.unconstrained.contacts, self.active, strict=True)
+        springs = [term for contact, active in pairs if (term := contact.springs(active)) is not None]
+        if not springs:
+            return residual
+        return residual - nodes.dt * nodes.potential.on_nodes([term.force(self.moved) for term in springs])
 
     def impulse(self, residual: NodeVector) -> NodeVector:
         """The impulse of walls, planes and contacts, without colliders, on each true node [kg m/s], shape (n, d)."""
@@ -315,7 +318,7 @@ def constrain(nodes: Any, active: ActiveSet) -> ConstrainedNodes:
 def count_places(nodes: Any, *sets: ActiveSet) -> Int[Array, ""]:
     """How many places some sets have."""
     pairs = [
-        (contact.representative(), mask) for part in sets for contact, mask in zip(nodes.contacts, part, strict=True)
+        (contact.representative, mask) for part in sets for contact, mask in zip(nodes.contacts, part, strict=True)
     ]
     counts = ((mask if one is None else mask & one).sum().astype(jnp.int32) for one, mask in pairs)
     return sum(counts, jnp.asarray(0, jnp.int32))

@@ -47,10 +47,10 @@ class PlaneContact(AbstractContact):
         """Direction of the normals."""
         return self.walls[0].axis
 
-    def known_at_start(self, nodes: Any, explicit: bool) -> bool:
-        """In explicit steps, where nothing across another axis and no other boundary moves the nodes of a column."""
+    def known_at_start(self, nodes: Any) -> bool:
+        """Where nothing across another axis and no other boundary moves the nodes of a column."""
         alone = all(wall.axis == self.axis for wall in walls_of(nodes)) and not nodes.potential.mirror.images
-        return explicit and alone and not nodes.conditions.holds
+        return alone and not nodes.conditions.holds
 
     def images(self, active: Array) -> tuple[WallImage, ...]:
         return tuple(replace(wall, held=active[..., k : k + 1]) for k, wall in enumerate(self.walls))

@@ -146,9 +146,9 @@ class SlipBox(AbstractHoldingBox):
 class SeparatingBox(AbstractBox):
     """Walls that the material may leave, and along which it slides with Coulomb friction.
 
-    A wall pushes where a particle's face, half its width before its centre, is behind it (see `SurfaceContact`), with
-    the stiffness of half a spacing of the material: a pressure p presses faces p dx/(2M) into the wall, with M the
-    material's wave modulus. Friction is an impulse applied after the solve, opposed to the tangential velocity and at
+    A wall pushes where a particle's face, half its width behind its centre, is behind the wall (see `SurfaceContact`):
+    a pressure p presses faces p dx/(αM) into it, with M the material's wave modulus, and α = 2 in explicit steps and 20
+    in implicit ones. Friction is an impulse applied after the solve, opposed to the tangential velocity and at
     most `friction` times the normal impulse: it lags the solve by one step's elastic response.
 
     Walls lie anywhere, and have derivatives by their place.
@@ -157,7 +157,7 @@ class SeparatingBox(AbstractBox):
     bounce, and its motion has no derivative by a wall's place.
 
     *When it breaks*: particles that start nearer to a wall than half their width are pushed away as if they were
-    compressed by that much. A pressure of a twentieth of M presses by more than 2 % of a spacing.
+    compressed by that much. A pressure of 0.04 M, in implicit steps of 0.4 M, presses by 2 % of a spacing.
 
     Args:
         lower: position of the lower wall in each direction [m], (d,); −inf for none.
@@ -187,17 +187,17 @@ class SeparatingBox(AbstractBox):
         """Springs, and for what flows two walls an axis that hold the columns of nodes whose gap is shut; as at a
         `ContactPlane` springs push it in the implicit step that would bring its faces behind a wall."""
         assert faces is not None  # as it `pushes`
-        surfaces = tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
+        springs = tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
         if not any(shape.flows for shape in faces.shapes):
-            return surfaces
+            return springs
         flowing = faces.flowing
-        shut = jnp.stack([flowing & (surface.gap <= SHUT * faces.spacing) for surface in surfaces])
+        shut = jnp.stack([flowing & (spring.gap <= SHUT * faces.spacing) for spring in springs])
         # one sum at the nodes for all walls
         around = scatter(faces.stencil, shut.reshape(-1, len(flowing)).astype(faces.x.dtype), None, grid.size)
         contacts: list[AbstractContact] = []
-        for axis, surface in enumerate(surfaces):
+        for axis, spring in enumerate(springs):
             if not (faces.explicit and flowing.all()):
-                contacts.append(replace(surface, near=surface.near & ~shut[axis]))
+                contacts.append(replace(spring, near=spring.near & ~shut[axis]))
             walls = wall_images(self.across(axis), faces, grid, window)
             contacts.append(plane_contact(walls, SIGNS, self.friction, around[:, 2 * axis : 2 * axis + 2]))
         return tuple(contacts)

@@ -187,12 +187,9 @@ def conjugate_residual(
     eps, max_steps, dot = jnp.finfo(b.dtype).eps, jnp.asarray(max_steps), space.dot
     b_norm = jnp.sqrt(dot(b, b))
 
-    def in_progress(c: Iterate) -> Bool[Array, ""]:
-        steps_left = c.k.astype(max_steps.dtype) < max_steps
-        return (jnp.sqrt(c.rr) > rtol * b_norm) & ~c.small_increment & ~c.breakdown & steps_left
-
     def cond_fun(c: Iterate) -> Bool[Array, ""]:
-        return ~c.done & in_progress(c) & (c.rr > (_REACH * eps) ** 2 * c.restart_rr)
+        steps_left = c.k.astype(max_steps.dtype) < max_steps
+        return ~c.done & (jnp.sqrt(c.rr) > rtol * b_norm) & ~c.small_increment & ~c.breakdown & steps_left
 
     def body_fun(c: Iterate) -> Iterate:
         s, gamma = space.product(c.r)
@@ -215,8 +212,9 @@ def conjugate_residual(
         # an infinite γ makes the first β zero, so that p and q begin as r and s
         start = c._replace(r=r, p=zeros, q=zeros, rr=rr, qq=zero, gamma=infinite, restart_rr=rr)
         stalled = rr > c.restart_rr / 4
-        start = start._replace(stalled=stalled, done=stalled | ~in_progress(start))
-        end = jax.lax.while_loop(cond_fun, body_fun, start)
+        start = start._replace(stalled=stalled, done=stalled | ~cond_fun(start))
+        least = (_REACH * eps) ** 2 * rr
+        end = jax.lax.while_loop(lambda c: cond_fun(c) & (c.rr > least), body_fun, start)
         moved = end.x - c.x
         return end._replace(correction=jnp.where(end.done, c.correction, jnp.sqrt(dot(moved, moved))))
 

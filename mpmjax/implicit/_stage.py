@@ -50,7 +50,7 @@ class StageProblem(eqx.Module):
 
     The equation is M (v − a) − Δt_s f(u + θΔt_s v) = 0, the left side being the gradient of the incremental potential
     𝓔(v) = ½ ‖v − a‖²_M + Φ(u + θΔt_s v)/θ (eq. 23). Viscosity adds θΔt_s D v to it and ½ θΔt_s v·D v to the potential.
-    With `linearised`, f(u) is f(0) − H u and the equation (M + χ H) v = b with χ = θΔt_s² (eq. 17).
+    In a linearised problem f(u) is f(0) − H u and the equation (M + χ H) v = b with χ = θΔt_s² (eq. 17).
     """
 
     mass: NodeScalar  # nodal masses m_i [kg], shape (n,)
@@ -71,7 +71,7 @@ class StageProblem(eqx.Module):
         """M + θΔt_s D + θΔt_s² H at v, the derivative of `residual`.
 
         Args:
-            v: v [m/s], shape (n, d).
+            v: v [m/s], shape (n, d); a linearised problem has one operator, whatever it is.
             hessian: an approximation of H in a problem that is not linearised. Default: H without approximation.
         """
         action = self.action

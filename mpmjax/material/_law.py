@@ -136,10 +136,12 @@ class AbstractLaw(eqx.Module):
         yielded, whichever is larger. Torn material has lost its stiffness and not its mass, and walls must hold it.
         Of J alone its pressure p is added, so that explicit springs of stiffness 2 (M + p) let no pressure press a face
         by more than half a spacing."""
-        now, intact = (self.elastic(a).wave_modulus(F) for a in (history, self.initial_history(F)))
+        modulus = self.elastic(history).wave_modulus(F)
         if F.ndim == 1:
-            now = now + jnp.maximum(-self.elastic(history).stress(F), 0)
-        return jnp.broadcast_to(jnp.maximum(now, intact), F.shape[self.measure.axes :])
+            modulus = modulus + jnp.maximum(-self.elastic(history).stress(F), 0)
+        if history is not None:
+            modulus = jnp.maximum(modulus, self.elastic(self.initial_history(F)).wave_modulus(F))
+        return jnp.broadcast_to(modulus, F.shape[self.measure.axes :])
 
     def compaction(self, history: Any, /) -> Float[Array, "p"] | float:
         """The volume that yielding has left [-], at most 1, shape (p,), where the deformation that is stored is the

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -89,11 +89,10 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     differentiated, and friction acts after that."""
     guess, violations = method.initial_guess(nodes), None
     start = method.mean_displacement(nodes, NodeMotion(guess))
-    # what nothing holds moves with v*: the gaps that this closes are the first guess
-    predictor, nothing_held = nodes.explicit_velocity(), ConstrainedNodes(nodes, (), Mirror(()), nodes, start)
-    active = tuple(contact.likely_held(nothing_held, predictor) for contact in nodes.contacts)
+    nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, start)
+    active = tuple(contact.likely_held(nothing_held) for contact in nodes.contacts)
     # the force of an explicit step is known at its start, and with it which gaps are shut
-    if all(contact.known_at_start(nodes, method.is_explicit) for contact in nodes.contacts):
+    if method.is_explicit and all(contact.known_at_start(nodes) for contact in nodes.contacts):
         held, sweeps = constrain(nodes, active), jnp.asarray(0, jnp.int32)
         motion, info = _advance(held, method, guess)
     else:
@@ -110,6 +109,15 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     return replace(new, motion=motion, friction=friction, contact=ContactInfo(sweeps, violations))
 
 
+class _Sweep(NamedTuple):
+    following: ActiveSet  # the set of the next sweep
+    active: ActiveSet
+    motion: NodeMotion
+    cost: SolveInfo  # of all solves
+    given_up: Int[Array, ""]  # sets before this one
+    violations: Int[Array, ""]
+
+
 def find_active_set(
     nodes: Nodes, method: AbstractIntegrator, active: ActiveSet, guess: NodeVector
 ) -> tuple[ActiveSet, NodeMotion, SolveInfo, Int[Array, ""], Int[Array, ""]]:
@@ -117,21 +125,22 @@ def find_active_set(
     up, and of places where it is violated; from a first set and velocity [m/s]. No contact may hold anything of the
     nodes yet. Not to be differentiated: loops have no derivative."""
 
-    def sweep(state: tuple) -> tuple:
-        active, _, motion, cost, count, _ = state
+    def sweep(state: _Sweep) -> _Sweep:
+        active = state.following
         held = constrain(nodes, active)
-        motion, info = _advance(held, method, motion.carrier)
+        motion, info = _advance(held, method, state.motion.carrier)
         held, new, holding = _held_update(held, method, motion, info)
         pulls, enters = held.violations(new.solved.velocity, holding)
         # all places are exchanged at once (a primal-dual active set), so that the sweeps do not grow with their number
         following = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
-        return following, active, motion, cost.followed_by(info), count + 1, count_places(nodes, pulls, enters)
+        cost, violations = state.cost.followed_by(info), count_places(nodes, pulls, enters)
+        return _Sweep(following, active, motion, cost, state.given_up + 1, violations)
 
-    motion, _ = eqx.filter_eval_shape(lambda: _advance(constrain(nodes, active), method, guess))
+    motion, cost = eqx.filter_eval_shape(lambda: _advance(constrain(nodes, active), method, guess))
     motion = jax.tree.map(lambda _: guess, motion)  # all fields of nodes: the first solve starts from the carrier
-    cost = SolveInfo(residual=jnp.zeros((), guess.dtype), report=jnp.zeros((), guess.dtype))
-    first = active, active, motion, cost, jnp.asarray(-1, jnp.int32), jnp.asarray(1, jnp.int32)
-    return jax.lax.while_loop(lambda s: (s[4] < SWEEPS) & (s[5] > 0), sweep, first)[1:]
+    cost = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), cost)
+    first = _Sweep(active, active, motion, cost, jnp.asarray(-1, jnp.int32), jnp.asarray(1, jnp.int32))
+    return jax.lax.while_loop(lambda s: (s.given_up < SWEEPS) & (s.violations > 0), sweep, first)[1:]
 
 
 def _advance(held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import NodeVector, Scalar
-from mpmjax.implicit import SolveInfo
+from mpmjax.implicit import SolveInfo, no_solve
 from mpmjax.stepping._nodes import Nodes
 
 
@@ -38,8 +38,7 @@ class AbstractIntegrator(eqx.Module):
     """
 
     is_explicit: ClassVar[bool] = False
-    """Whether the update solves no system, so that a run takes no statistics of solves. Advice on faults and
-    `work_precision` use it."""
+    """Whether the update solves no system, and takes the force at the start of the step."""
     needs_separate_force: ClassVar[bool] = True
     """Whether v^n and the force are needed separately. An integrator whose v^{n+1} is `nodes.explicit_velocity()`
     wherever nothing is prescribed may set it to False. P2G then sums momentum and force together where it can, at half
@@ -139,8 +138,7 @@ class Explicit(AbstractIntegrator):
         v = nodes.explicit_velocity()
         if nodes.conditions.holds:
             v = nodes.projection.combine(v, nodes.prescribed)
-        zero = jnp.zeros((), v.dtype)
-        return NodeMotion(v), SolveInfo(residual=zero, report=zero)
+        return NodeMotion(v), no_solve(v.dtype)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(0) [kg m/s], on nodes that have mass."""

@@ -171,8 +171,8 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator, t: Sc
         # the fastest rate at which the present acceleration a strains each particle: the eigenvalue of the symmetric
         # part of ∇a that is largest in magnitude, or |div a| for a law that knows J alone
         at_rest = ConstrainedNodes(nodes, (), Mirror(()), nodes)
-        contacts = [contact for contact in nodes.contacts if contact.known_at_start(nodes, True)]
-        springs = (contact.springs(contact.likely_held(at_rest, nodes.velocity)) for contact in contacts)
+        contacts = [contact for contact in nodes.contacts if contact.known_at_start(nodes)]
+        springs = (contact.springs(contact.likely_held(at_rest)) for contact in contacts)
         # springs that are shut already push at the start, and what they accelerate strains the particles
         terms = tuple(spring for spring in springs if spring is not None)
         pushed = nodes.constrained(Mirror(()), nodes.mass, nodes.conditions.fixed, terms)

@@ -146,11 +146,11 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
         F=points[0].deformation if together else None,
         keep_gradient=scene.keeps_gradient,
     )
-    grad_v = gathered.gradient if radius is None else in_space(radius, gathered.carrier, gathered.gradient)
-    if (F := gathered.F) is None:
-        deformations = [q.deformation + dt * q.change(q.rows_of(grad_v)) for q in points]
+    if gathered.F is not None:
+        deformations = [gathered.F]
     else:
-        deformations = [F]
+        grad_v = gathered.gradient if radius is None else in_space(radius, gathered.carrier, gathered.gradient)
+        deformations = [q.deformation + dt * q.change(q.rows_of(grad_v)) for q in points]
     after = State(
         x=particle_first(gathered.x),
         v=particle_first(gathered.velocity),
