@@ -82,6 +82,20 @@ constexpr auto before_of(std::integer_sequence<int, lane...>) {
   return std::integer_sequence<int, (lane > 0 ? lane - 1 : 0)...>();
 }
 
+// The first nodes of particles along an axis, ⌊ξ − (s − 2)/2⌋, and the offsets t from the middle of the places that have
+// these. What is beyond the integers is far from the window, and what is no number on its first node, as XLA has it.
+template <int s, class T>
+MPMJAX_INLINE Simd<T> first_of(Simd<T> place) {
+  constexpr T kFar = 1 << 30;
+  const Simd<T> low = place - T(s - 2) / 2, least = low == low ? Simd<T>{} - kFar : Simd<T>{};
+  const Simd<T> near = low > -kFar ? (low < kFar ? low : -least) : least;
+  using Index = LanesOf<float, kSimdLanes<T>>;
+  const Simd<T> whole = __builtin_convertvector(__builtin_convertvector(near, Index), Simd<T>);
+  return whole > near ? whole - 1 : whole;
+}
+template <int s, class T>
+MPMJAX_INLINE Simd<T> offset_of(Simd<T> place) { return place - first_of<s, T>(place) - T(s - 1) / 2; }
+
 // The weights of a block and their slopes along each axis.
 template <class T, int d, int s>
 struct Block {
@@ -96,12 +110,13 @@ struct Block {
   int32_t least[kBlock], most[kBlock];
   int32_t least_beyond[kBlock], most_beyond[kBlock];
 
-  // The polynomials, with derivatives along some axes, a bit each, times dt if there is one; those of no particle are
+  // The polynomials, with derivatives along some axes, a bit each, times dξ if there is one; those of no particle are
   // zero. The index is read by `find_range`.
   MPMJAX_NOINLINE void evaluate(const Stencils<T>& from, int64_t first, int count, unsigned differentiated = 0) {
     for (int a = 0; a < d; ++a) {
       T t[kBlock], dt[kBlock];
-      copy(from.offset + a * from.particles + first, count, t);
+      copy(from.place + a * from.particles + first, count, t);
+      for (int q = 0; q < kBlock; q += kSimdLanes<T>) store(t + q, offset_of<s, T>(load_as<Simd<T>>(t + q)));
       if (!(differentiated >> a & 1)) {
         set<0>(from.basis, a, t, count, nullptr);
       } else if (from.change == nullptr) {
@@ -137,22 +152,27 @@ struct Block {
     }
   }
 
-  // The index terms of an axis, (first + i) stride or around a periodic one; for no particle those from node 0 on. They
-  // wrap as 32-bit integers do: those of a particle outside of the window have no meaning, and may be any number.
+  // The index terms of an axis, (first + i) stride or around a periodic one. They wrap as 32-bit integers do: those of
+  // a particle outside of the window, or of none, have no meaning, and may be any number.
   MPMJAX_INLINE void read_index(const Stencils<T>& from, int a, int64_t first, int count) {
+    T place[kBlock];
     int32_t begin[kBlock];
-    copy(from.first + a * from.particles + first, count, begin);
+    copy(from.place + a * from.particles + first, count, place);
+    for (int q = 0; q < kBlock; q += kSimdLanes<T>) {
+      const Simd<T> whole = first_of<s, T>(load_as<Simd<T>>(place + q));
+      store(begin + q, __builtin_convertvector(whole, LanesOf<float, kSimdLanes<T>>));
+    }
     const uint32_t stride = static_cast<uint32_t>(from.basis.strides[a]);
     const BlockUint node = load_as<BlockUint>(begin);
 #pragma GCC unroll 4
     for (int i = 0; i < s; ++i) store(index[a][i], (node + i) * stride);
-    if (from.basis.periodic[a]) wrap_index(from.basis.shape[a], stride, begin, count, index[a]);
+    if (from.basis.periodic[a]) wrap_index(from.basis.shape[a], stride, begin, index[a]);
   }
 
   // Nodes of the same period of so many nodes as the first one.
-  static MPMJAX_NOINLINE void wrap_index(int32_t period, uint32_t stride, const int32_t* begin, int count,
-                                      int32_t (*terms)[kBlock]) {
-    for (int q = 0; q < count; ++q) {
+  static MPMJAX_NOINLINE void wrap_index(int32_t period, uint32_t stride, const int32_t* begin,
+                                         int32_t (*terms)[kBlock]) {
+    for (int q = 0; q < kBlock; ++q) {
       const int32_t place = begin[q] % period, from_start = place < 0 ? place + period : place;
       for (int i = 0; i < s; ++i) {
         const int32_t node = (from_start + i) % period - from_start;

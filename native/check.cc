@@ -39,13 +39,13 @@ Problem<T> sized(const Shape& sh, int64_t columns) {
   return task;
 }
 
-// First nodes and offsets, some of them wild.
+// Places, some of them wild.
 template <class T>
 void place(const Stencils<T>& stencils, const Shape& sh, Random& random) {
   const auto& basis = stencils.basis;
   const int32_t along = int32_t(sh.along), beyond = sh.places > kInside ? 2 : 0;
   std::uniform_int_distribution<int32_t> inside(-beyond, along - sh.s + beyond), around(-beyond, along - 1 + beyond);
-  std::uniform_int_distribution<int32_t> any(std::numeric_limits<int32_t>::min());
+  std::uniform_int_distribution<int32_t> any(-(1 << 20), 1 << 20);
   std::uniform_real_distribution<float> half(-0.5f, 0.5f);
   for (int64_t i = 0; i < sh.batch * sh.d * sh.particles; ++i) {
     const int64_t p = i % sh.particles, side = along - sh.s + 1;
@@ -57,8 +57,7 @@ void place(const Stencils<T>& stencils, const Shape& sh, Random& random) {
     if (sh.places == kByRow && a == 0) first = int32_t(p * side / sh.particles);
     if (sh.places == kOneCell) first = 0;
     if (sh.places == kAnywhere && p % 7 == 3) first = any(random);
-    changed(stencils.first)[i] = first;
-    changed(stencils.offset)[i] = sh.places == kAnywhere && i % 97 == 0 ? NAN : half(random);
+    changed(stencils.place)[i] = sh.places == kAnywhere && i % 97 == 0 ? NAN : first + half(random) + T(sh.s - 1) / 2;
   }
 }
 
@@ -76,7 +75,7 @@ Example<Problem<T>> check(const std::string& what, const Shape& sh, int64_t colu
   // What is not finite, at nodes or of particles; only of NaNs have sums the same bits, however they are divided.
   for (const Array& array : tested.arrays) {
     const bool wild = sh.places == kInTurn || sh.places == kAnywhere;
-    if (!wild || array.is_result || !array.has_numbers || array.as<T>() == tested.task.stencils.offset) continue;
+    if (!wild || array.is_result || !array.has_numbers || array.as<T>() == tested.task.stencils.place) continue;
     const T number = std::is_same_v<Problem<T>, Gather<T>> ? INFINITY : NAN;
     for (int64_t i = 89; i < array.count; i += 997) array.as<T>()[i] = number;
   }
@@ -169,8 +168,7 @@ void check_resistance(const Shape& sh, const Pools& pools) {
 // Copies what places particles, to double.
 template <class T>
 void place_alike(const Stencils<T>& from, const Stencils<double>& to, int64_t batch) {
-  const int64_t count = batch * from.basis.d * from.particles;
-  std::copy_n(from.first, count, changed(to.first)), std::copy_n(from.offset, count, changed(to.offset));
+  std::copy_n(from.place, batch * from.basis.d * from.particles, changed(to.place));
 }
 
 // P2G, against an average of what it makes of its arrays.
@@ -200,7 +198,7 @@ void check_p2g(const Shape& sh, const Pools& pools) {
       const double mass = changed(task.mass)[i] = 1 + std::abs(task.mass[i]);
       for (int k = 0; k <= d; ++k) at(made.values.value, d + 1, k) = k < d ? mass * at(task.v, d, k) : mass;
       for (int c = 0; c < d; ++c) {
-        const double t = at(task.stencils.offset, d, c);
+        const double place = at(task.stencils.place, d, c), t = place - std::floor(place) - 0.5;  // of the linear kernel
         const double moment = sh.s == 2 ? 0.25 - t * t : sh.s == 3 ? 1 / 4.0 : 1 / 3.0;
         for (int k = 0; k < d; ++k) {
           double pushes = isotropic && k == c ? task.r[i] : 0;

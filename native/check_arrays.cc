@@ -181,8 +181,9 @@ void check_solve(int d, int64_t particles, int64_t along, const Pools& pools) {
     sizes.room = room;
     Example<Solve<T>> e(sizes, batch, random);
     Solve<T>& task = e.task;
-    for (int64_t i = 0; i < batch * d * particles; ++i) changed(task.stencils.first)[i] = random() % (along - 2);
-    for (int64_t i = 0; i < batch * d * particles; ++i) changed(task.stencils.offset)[i] = some(random) - T(1.5);
+    for (int64_t i = 0; i < batch * d * particles; ++i) {
+      changed(task.stencils.place)[i] = random() % (along - 2) + some(random) - T(0.5);
+    }
     for (int64_t i = 0; i < batch * matrix_entries(d) * particles; ++i) changed(task.matrices)[i] /= 10;
     for (int64_t i = 0; i < batch * task.nodes; ++i) changed(task.mass)[i] = some(random);
     for (int64_t i = 0; i < batch * size; ++i) {

@@ -1,5 +1,5 @@
 // The gather, a_p = Σ_i w_ip f_i and a_p,b = Σ_i g_ip,b f_i, and the pull, the derivative of
-// B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b) by the offset along each axis.
+// B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b) by ξ along each axis.
 //
 // There is a particle in each lane, so that sums over its nodes are sums of vectors, and what particles have is read
 // and written as it lies. The nodes of a row are read once, by runs where there are few; else they are read particle by
@@ -68,7 +68,7 @@ struct GivenValues {
 };
 
 // A pull, and the gather beside it. B is linear in the numbers f · a and f · a_b of each node. Its sums over the axes
-// from a on: without a derivative, and by the offset along each of these axes, one of f · a and the gradients along
+// from a on: without a derivative, and by ξ along each of these axes, one of f · a and the gradients along
 // these axes, and one of f · a_b for each axis before them.
 template <class T, int d, int s, int columns>
 struct PullSums {
@@ -312,8 +312,8 @@ void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
         const auto result = nodes.template sum<PullSums<T, d, s, columns>>(given);
         by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
           for (int a = 0; a < d; ++a) {
-            const Simd<T> before = c == 0 ? Simd<T>{} : lanes.template load<all>(task.by_offset, a);
-            lanes.template store<all>(task.by_offset, a, before + result.by[a + 1][0]);
+            const Simd<T> before = c == 0 ? Simd<T>{} : lanes.template load<all>(task.by_place, a);
+            lanes.template store<all>(task.by_place, a, before + result.by[a + 1][0]);
           }
         });
         if (task.value == nullptr) continue;

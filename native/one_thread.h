@@ -31,6 +31,16 @@ struct alignas(c * sizeof(T) % 16 == 0 ? 16 : c * sizeof(T) % 8 == 0 ? 8 : sizeo
   T at[c];
 };
 
+// The first node of a particle along an axis, ⌊ξ − (s − 2)/2⌋. What is beyond the integers is far from the window, and
+// what is no number on its first node, as XLA has it.
+template <int s, class T>
+int32_t first_of(T place) {
+  constexpr T kFar = 1 << 30;
+  const T low = place - T(s - 2) / 2, near = low > -kFar ? (low < kFar ? low : kFar) : low == low ? -kFar : 0;
+  const int32_t whole = static_cast<int32_t>(near);
+  return whole > near ? whole - 1 : whole;
+}
+
 template <class T>
 void add(T* to, T number) {
 #if defined(__CUDACC_RTC__)
@@ -64,7 +74,7 @@ struct Particle {
   Particle(const Stencils<T>& from, int64_t p) : number(p) {
     const Basis<T>& basis = from.basis;
     MPMJAX_UNROLL for (int a = 0; a < d; ++a) {
-      const int32_t first = from.first[a * from.particles + p], period = basis.shape[a];
+      const int32_t first = first_of<s>(from.place[a * from.particles + p]), period = basis.shape[a];
       const int32_t rest = basis.periodic[a] ? first % period : 0, place = rest < 0 ? rest + period : rest;
       MPMJAX_UNROLL for (int i = 0; i < s; ++i) {
         const uint32_t beyond = basis.periodic[a] ? (place + i) % period - place : i;
@@ -78,7 +88,8 @@ struct Particle {
     MPMJAX_UNROLL for (int a = 0; a < d; ++a) {
       const int64_t at = a * from.particles + number;
       const bool slope = differentiated >> a & 1;
-      const T t = from.offset[at], factor = slope && from.change != nullptr ? from.change[at] : T(1);
+      const T place = from.place[at], t = place - first_of<s>(place) - T(s - 1) / 2;
+      const T factor = slope && from.change != nullptr ? from.change[at] : T(1);
       polynomials(from.basis, from.basis.weights, t, slope, factor, weights[a]);
       polynomials(from.basis, from.basis.slopes, t, slope, factor, slopes[a]);
     }
@@ -201,7 +212,7 @@ Gathered<T, d, From::c, a> collect(const Particle<T, d, s>& at, uint32_t node, c
   return sums;
 }
 
-// The sums of a pull over the axes from a on, without a derivative and by the offset along each of these axes: one of
+// The sums of a pull over the axes from a on, without a derivative and by ξ along each of these axes: one of
 // f · a and the gradients along these axes, and one of f · a_b for each axis before them.
 template <class T, int d, int a>
 struct Pulled {
@@ -292,7 +303,7 @@ void run(const Pull<T>& all, int64_t p) {
     const auto sums = pull_from<0>(at, slope, 0, given, nodes);
     MPMJAX_UNROLL for (int b = 0; b < d; ++b) total[b] += sums.by[b + 1][0];
   }
-  MPMJAX_UNROLL for (int b = 0; b < d; ++b) all.by_offset[b * all.stencils.particles + p] = total[b];
+  MPMJAX_UNROLL for (int b = 0; b < d; ++b) all.by_place[b * all.stencils.particles + p] = total[b];
 }
 
 // r_p = K_p G_p of the gradients G_p of what is gathered, and their scatter.

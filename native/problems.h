@@ -9,8 +9,8 @@
 //   pull     ∂B/∂t,   B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b)
 //   resist   the scatter of K_p times the gather's gradients, with a symmetric matrix K_p for each particle
 //
-// Weights are products of one polynomial along each axis, of the particle's offset t; of a gradient's the one along its
-// direction is a slope.
+// Weights are products of one polynomial along each axis, of the offset t of the particle's place ξ; of a gradient's the
+// one along its direction is a slope.
 //
 // Each problem lists its arrays once, in the order of XLA's operands and results: `arrays(f)` calls f(pointer, shape)
 // for all of them, and f(pointer, shape, kOptional) for those that may be null. `batch` problems follow each other in
@@ -67,15 +67,14 @@ struct Basis {
 
 template <class T>
 struct Stencils {
-  const int32_t* first;
-  const T* offset;  // t
-  const T* change;  // dt, for the differential of a sum along it; null for the sum itself
+  const T* place;   // ξ, in spacings from the window's first node
+  const T* change;  // dξ, for the differential of a sum along it; null for the sum itself
   int64_t particles;
   Basis<T> basis;
 
   template <class F>
   void arrays(const F& f) {
-    f(first, {basis.d, particles}), f(offset, {basis.d, particles});
+    f(place, {basis.d, particles});
   }
 };
 
@@ -216,7 +215,7 @@ struct Pull {
   Stencils<T> stencils;
   const T* nodes;
   ParticleValues<T> values;
-  T* by_offset;
+  T* by_place;
   T* value;  // the gather of the nodes, as in a gather; null where it is not wanted
   T* gradients;
   int64_t size;
@@ -226,7 +225,7 @@ struct Pull {
   void arrays(const F& f) {
     const int d = stencils.basis.d;
     int64_t& p = stencils.particles;
-    stencils.arrays(f), f(nodes, {size, columns}), values.arrays(f, d, columns, p), f(by_offset, {d, p});
+    stencils.arrays(f), f(nodes, {size, columns}), values.arrays(f, d, columns, p), f(by_place, {d, p});
     f(value, {columns, p}, kOptional), f(gradients, {d, columns, p}, kOptional);
   }
 };

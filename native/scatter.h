@@ -387,7 +387,10 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
         }
         for (int b = 0; b < d; ++b) {
           V moment = V{} + (s == 3 ? T(1) / 4 : T(1) / 3);
-          if (s == 2) moment = T(0.25) - read(task.stencils.offset, b) * read(task.stencils.offset, b);
+          if (s == 2) {
+            const V t = offset_of<s, T>(read(task.stencils.place, b));
+            moment = T(0.25) - t * t;
+          }
           for (int r = 0; r < d; ++r) {
             given[r] = spacing * moment * C[r][b];
             if (task.A != nullptr && task.B == nullptr) given[r] += A[r][b];

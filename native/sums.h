@@ -64,8 +64,8 @@ std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, int64_t part
   for (int64_t k = 0; parts > 1 && k < samples; ++k) {
     int64_t middle = 0;  // the flat index of a node in the middle of a particle's stencil
     for (int a = 0; a < stencils.basis.d; ++a) {
-      const int64_t first = stencils.first[a * particles + k * particles / samples];
-      middle += (first + stencils.basis.s / 2) * stencils.basis.strides[a];
+      const T place = stencils.place[a * particles + k * particles / samples];
+      middle += std::abs(place) < INT32_MAX ? static_cast<int64_t>(place) * stencils.basis.strides[a] : -size;
     }
     if (middle >= 0 && middle < size) places.push_back(middle);
   }

@@ -58,9 +58,8 @@ def test_they_are_the_sums_that_weights_and_gradients_say(c, gradient, d, kernel
 
 def test_what_goes_to_no_node_is_dropped():
     """Beyond either end; the rest arrives. Nothing else is touched."""
-    first = jnp.asarray([[-1, 0, 3, 4, 2**30]], jnp.int32)
-    basis = basis_of(mpm.BSpline(1), mpm.Grid((4,), 1.0))
-    stencil = Stencil(first, jnp.full((1, 5), -0.5), jnp.asarray(1.0), first[0] > 0, basis)  # each on its first node
+    xi = jnp.asarray([[-1.0, 0, 3, 4, 2**30]])  # each on its first node
+    stencil = Stencil(xi, jnp.asarray(1.0), xi[0] > 0, basis_of(mpm.BSpline(1), mpm.Grid((4,), 1.0)))
     np.testing.assert_array_equal(scatter(stencil, jnp.ones((3, 5)), None, 4), np.tile([[1.0], [0], [0], [1]], 3))
 
 
@@ -161,7 +160,7 @@ def test_the_program_for_other_platforms_is_the_same_sum(d, monkeypatch):
     monkeypatch.setenv("MPMJAX_BACKEND", "xla")
     _, stencil, given, nodes = example(d)
     groups, rows = _sums.given_rows(stencil, given[0], given[1:])
-    at, params = (stencil.first, stencil.offset, None), {"basis": stencil.basis, "groups": groups}
+    at, params = (stencil.xi, None), {"basis": stencil.basis, "groups": groups}
     loops, kernel = (_sums.gather_sum.function(*at, nodes, **params, unroll=unroll) for unroll in (False, True))
     jax.tree.map(lambda a, b: assert_close(a, b, 1e-15), loops, kernel)
     loops, kernel = (_sums.scatter_sum.function(*at, rows, **params, size=5**d, unroll=u) for u in (False, True))

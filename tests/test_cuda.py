@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from helpers import thorough
 from test_native import (
-    SIDE,
     agree,
     averaged,
     basis_for,
+    first_in_window,
     problem,
     resistance,
     resisted,
@@ -92,9 +92,9 @@ def test_sums_agree(one_by_one, d, s, c, dtype):
     """With nodes beyond the window, and around periodic axes."""
     args = problem(d, s, c, 21, dtype)
 
-    def each(first, *floats):
-        around = summed(basis_for(d, s, periodic=True), first % SIDE, *floats)
-        return summed(basis_for(d, s), first, *floats), around
+    def each(xi, *floats):
+        around = summed(basis_for(d, s, periodic=True), first_in_window(xi, s), *floats)
+        return summed(basis_for(d, s), xi, *floats), around
 
     agree(*one_by_one(each, *args), dtype)
 
@@ -105,13 +105,13 @@ def test_sums_agree_whatever_is_given(one_by_one, d):
     """Of the value, gradients, or both, of fewer columns too; of squares, moved along dt, and in a batch."""
     args, basis, c = problem(d, 3, 2, 21, "float64"), basis_for(d, 3), 2
 
-    def each(first, t, *floats):
-        squared = Stencil(first, t, jnp.ones(()), jnp.ones(21, bool), basis).squared.basis
-        moved = jax.jvp(lambda t: summed(basis, first, t, *floats), (t,), (jnp.cos(t),))[1]
+    def each(xi, *floats):
+        squared = Stencil(xi, jnp.ones(()), jnp.ones(21, bool), basis).squared.basis
+        moved = jax.jvp(lambda xi: summed(basis, xi, *floats), (xi,), (jnp.cos(xi),))[1]
         choices = ({"graded": False}, {"valued": False}, {"graded": c - 1})
         return (
-            [summed(basis, first, t, *floats, **which) for which in choices],
-            summed(squared, first, t, *floats),
+            [summed(basis, xi, *floats, **which) for which in choices],
+            summed(squared, xi, *floats),
             moved,
         )
 
@@ -126,8 +126,8 @@ def test_sums_agree_whatever_is_given(one_by_one, d):
 def test_averages_and_resistances_agree(one_by_one, d, dtype):
     """With empty nodes, for no particle, and in a batch."""
     for p in (30, 0):
-        first, t, given, _ = problem(d, 3, 3, p, dtype)
-        found, expected = one_by_one(averaged, first, t, given[0], given[1:])
+        xi, given, _ = problem(d, 3, 3, p, dtype)
+        found, expected = one_by_one(averaged, xi, given[0], given[1:])
         agree(found, expected, dtype)
         assert (found[0] == 0).any()
     args = resistance(d, 30, dtype)
@@ -141,8 +141,8 @@ def test_averages_and_resistances_agree(one_by_one, d, dtype):
 @NEEDS_COMPILER
 def test_a_particle_that_is_not_finite_spoils_its_own_nodes_alone(one_by_one):
     """As in XLA: the same entries are finite."""
-    first, t, given, nodes = problem(2, 3, 3, 20, "float32")
-    found, expected = one_by_one(partial(summed, basis_for(2, 3)), first, t.at[:, 5].set(jnp.nan), given, nodes)
+    xi, given, nodes = problem(2, 3, 3, 20, "float32")
+    found, expected = one_by_one(partial(summed, basis_for(2, 3)), xi.at[:, 5].set(jnp.nan), given, nodes)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(jnp.isfinite(a), jnp.isfinite(b)), found, expected)
 
 

@@ -18,11 +18,11 @@ from mpmjax.discretisation._stencil import (
     Basis as Basis,
     Stencil as Stencil,
     basis_of as basis_of,
-    first_nodes as first_nodes,
     in_section as in_section,
     in_space as in_space,
     in_window as in_window,
     make_stencil as make_stencil,
+    places as places,
 )
 from mpmjax.discretisation._sums import gather as gather, scatter as scatter
 from mpmjax.discretisation._transfer import (

@@ -47,7 +47,7 @@ def average(
         return _means(scatter(stencil, columns, gradients, size), least)
     groups, rows = given_rows(stencil, columns, gradients)
     basis = stencil.basis
-    return average_sum(stencil.first, stencil.offset, least, rows, basis=basis, groups=groups, size=size)
+    return average_sum(stencil.xi, least, rows, basis=basis, groups=groups, size=size)
 
 
 def _means(sums: Array, least: Array) -> tuple[Array, Array]:
@@ -60,23 +60,23 @@ def _means(sums: Array, least: Array) -> tuple[Array, Array]:
 @partial(
     custom_derivative,
     kernel="average",
-    results=lambda _, t, least, rows, size, **__: tuple(
-        jax.ShapeDtypeStruct(shape, t.dtype) for shape in ((size,), (size, rows[0].shape[1] - 1))
+    results=lambda xi, least, rows, size, **__: tuple(
+        jax.ShapeDtypeStruct(shape, xi.dtype) for shape in ((size,), (size, rows[0].shape[1] - 1))
     ),
     call=call_average,
 )
-def average_sum(first: Array, t: Array, least: Array, rows: Sequence[Array], **params: Any) -> tuple[Array, Array]:
+def average_sum(xi: Array, least: Array, rows: Sequence[Array], **params: Any) -> tuple[Array, Array]:
     """The whole weights and the averages, of columns of which the last is the weight."""
-    return _means(scatter_sum(first, t, None, rows, **params), least)
+    return _means(scatter_sum(xi, None, rows, **params), least)
 
 
 @average_sum.defjvp
 def _(primals: tuple, tangents: tuple, **params: Any) -> tuple[tuple[Array, Array], Any]:
     """dM and (d(Σ) − a dM) / M; the threshold is not differentiated. Averages are saved for reverse mode here, where
     the rule takes them: named afterwards they would be others, and these computed again."""
-    (first, t, _, rows), (_, dt, _, changes) = primals, tangents
+    (xi, _, rows), (dxi, _, changes) = primals, tangents
     whole, means = saved_for_backward(average_sum(*primals, **params), sums=True)
-    change = scatter_change(first, t, dt, rows, changes, **params)
+    change = scatter_change(xi, dxi, rows, changes, **params)
     if change is None:
         return (whole, means), (None, None)
     some = whole > 0
@@ -100,7 +100,7 @@ def resist(stencil: Stencil, upper: Float[Array, "t p"], u: NodeVector) -> NodeV
     if stencil.own_derivatives is not None:
         return scatter(stencil, None, _flux(upper, gather(stencil, u)[1]), len(u))
     upper, scaled = without_flat(stencil, upper), stencil.slope**2 * u
-    return resist_sum(stencil.first, stencil.offset, upper, scaled, basis=stencil.basis)
+    return resist_sum(stencil.xi, upper, scaled, basis=stencil.basis)
 
 
 def without_flat(stencil: Stencil, upper: Float[Array, "t p"]) -> Float[Array, "t p"]:
@@ -117,11 +117,11 @@ def _flux(upper: Array, slopes: Array) -> Array:
 
 
 @partial(custom_derivative, kernel="resist", call=lambda call, *args, basis: call(args, basis_attributes(basis)))
-def resist_sum(first: Array, t: Array, upper: Array, u: Array, *, basis: Basis) -> Array:
+def resist_sum(xi: Array, upper: Array, u: Array, *, basis: Basis) -> Array:
     """`resist` with gradients in spacings, dx² times as much, from the fields of a stencil."""
     groups = (Group(basis.gradient),)
-    (slopes,) = gather_sum(first, t, None, u, basis=basis, groups=groups)
-    return scatter_sum(first, t, None, [_flux(upper, slopes)], basis=basis, groups=groups, size=len(u))
+    (slopes,) = gather_sum(xi, None, u, basis=basis, groups=groups)
+    return scatter_sum(xi, None, [_flux(upper, slopes)], basis=basis, groups=groups, size=len(u))
 
 
 @resist_sum.defjvp
@@ -138,4 +138,4 @@ def _(primals: tuple, tangents: tuple, *, basis: Basis) -> tuple[Array, Any]:
 @resist_sum.deftranspose
 def _(cotangent: Array, args: tuple, *, basis: Basis) -> tuple:
     """In u it is symmetric."""
-    return None, None, None, resist_sum(*args[:-1], cotangent, basis=basis)
+    return None, None, resist_sum(*args[:-1], cotangent, basis=basis)

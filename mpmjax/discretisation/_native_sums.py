@@ -1,6 +1,6 @@
 """The sums between particles and nodes as kernels of back ends: what they are given.
 
-Kernels sum a value and a gradient, of first nodes and offsets. All arrays have the leading axes of a batch.
+Kernels sum a value and a gradient, of places ξ. All arrays have the leading axes of a batch.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,7 +46,7 @@ def _given(basis: Basis, amounts: dict[Any, Array]) -> list[Array | None]:
 
 
 def call_scatter(
-    call: Call, first: Array, t: Array, dt: Any, rows: Rows, *, basis: Basis, groups: Sequence[Any], size: int
+    call: Call, xi: Array, dxi: Any, rows: Rows, *, basis: Basis, groups: Sequence[Any], size: int
 ) -> Array | None:
     """`scatter_sum`: what is moved and what is not in a call each."""
     if not _have_kernels(basis, groups):
@@ -54,52 +54,52 @@ def call_scatter(
     total = []
     for moved in dict.fromkeys(group.moved for group in groups):
         some = {g.terms: a for g, a in zip(groups, rows, strict=True) if g.moved == moved}
-        total += call([first, t, dt if moved else None, *_given(basis, some)], basis_attributes(basis))
+        total += call([xi, dxi if moved else None, *_given(basis, some)], basis_attributes(basis))
     return sum(total[1:], total[0])
 
 
 def call_gather(
-    call: Call, first: Array, t: Array, dt: Any, nodes: Array, *, basis: Basis, groups: Sequence[Any]
+    call: Call, xi: Array, dxi: Any, nodes: Array, *, basis: Basis, groups: Sequence[Any]
 ) -> list[Array] | None:
     """`gather_sum`: what is moved and what is not in a call each."""
     if not _have_kernels(basis, groups):
         return None
     out = {}
     for moved in {group.moved for group in groups}:
-        operands = [first, t, dt if moved else None, nodes]
-        value, gradients = call(operands, basis_attributes(basis), results=_value_and_gradients(t, nodes))
+        operands = [xi, dxi if moved else None, nodes]
+        value, gradients = call(operands, basis_attributes(basis), results=_value_and_gradients(xi, nodes))
         out[basis.value, moved], out[basis.gradient, moved] = jnp.expand_dims(value, -3), gradients
     return [out[group.terms, group.moved] for group in groups]
 
 
-def _value_and_gradients(t: Array, nodes: Array) -> list[jax.ShapeDtypeStruct]:
-    d, p, columns = *t.shape[-2:], nodes.shape[-1]
+def _value_and_gradients(xi: Array, nodes: Array) -> list[jax.ShapeDtypeStruct]:
+    d, p, columns = *xi.shape[-2:], nodes.shape[-1]
     return [jax.ShapeDtypeStruct(shape, nodes.dtype) for shape in ((columns, p), (d, columns, p))]
 
 
 def call_pull(
-    call: Call, first: Array, t: Array, nodes: Array, rows: Rows, *, basis: Basis, groups: Sequence[Any], gathered: bool
+    call: Call, xi: Array, nodes: Array, rows: Rows, *, basis: Basis, groups: Sequence[Any], gathered: bool
 ) -> tuple[Array, list[Array]] | None:
     """`pull_sum`, and with `gathered` the gather of the nodes."""
     if not _have_kernels(basis, groups):
         return None
     terms = [group.terms for group in groups]
-    operands = [first, t, nodes, *_given(basis, dict(zip(terms, rows, strict=True)))]
-    results = [jax.ShapeDtypeStruct(t.shape[-2:], t.dtype), *(_value_and_gradients(t, nodes) if gathered else [])]
-    by_t, *out = call(operands, basis_attributes(basis), results=results)
+    operands = [xi, nodes, *_given(basis, dict(zip(terms, rows, strict=True)))]
+    results = [jax.ShapeDtypeStruct(xi.shape[-2:], xi.dtype), *(_value_and_gradients(xi, nodes) if gathered else [])]
+    by_xi, *out = call(operands, basis_attributes(basis), results=results)
     of = {basis.value: jnp.expand_dims(out[0], -3), basis.gradient: out[1]} if gathered else {}
-    return by_t, [of[some] for some in terms if gathered]
+    return by_xi, [of[some] for some in terms if gathered]
 
 
 def call_average(
-    call: Call, first: Array, t: Array, least: Array, rows: Rows, *, basis: Basis, groups: Sequence[Any], size: int
+    call: Call, xi: Array, least: Array, rows: Rows, *, basis: Basis, groups: Sequence[Any], size: int
 ) -> list[Array]:
     """`average_sum`."""
     amounts = _given(basis, dict(zip((group.terms for group in groups), rows, strict=True)))
     columns = rows[0].shape[-2]
     shapes = (size,), (size, columns - 1), (size, columns)  # the last one holds the sums before they are divided
-    results = [jax.ShapeDtypeStruct(shape, t.dtype) for shape in shapes]
-    return call([first, t, least, *amounts], basis_attributes(basis), results=results)[:2]
+    results = [jax.ShapeDtypeStruct(shape, xi.dtype) for shape in shapes]
+    return call([xi, least, *amounts], basis_attributes(basis), results=results)[:2]
 
 
 def call_p2g(
@@ -110,7 +110,7 @@ def call_p2g(
         return None
     factor, A, B = (jnp.zeros_like(least), None, None) if impulse is None else impulse
     A, q, r = (None, *A) if isinstance(A, tuple) else (A, None, None)
-    operands = [stencil.first, stencil.offset, least, stencil.slope, factor, mass, v, C, A, B, q, r]
+    operands = [stencil.xi, least, stencil.slope, factor, mass, v, C, A, B, q, r]
     d = v.shape[-2]
     shapes = (size,), (size, d), (size, d + 1)  # the last one holds the sums before they are divided
     results = [jax.ShapeDtypeStruct(shape, v.dtype) for shape in shapes]
@@ -123,5 +123,5 @@ def call_g2p(
     """`g2p_sum`, but for stencils with gradients of their own or without any. Particles are moved in place."""
     if stencil.own_derivatives is not None or stencil.flat is not None:
         return None
-    operands = [stencil.first, stencil.offset, nodes, stencil.slope, dt, x, F]
-    return call(operands, basis_attributes(basis), aliases={5: 2} if F is None else {5: 2, 6: 3})
+    operands = [stencil.xi, nodes, stencil.slope, dt, x, F]
+    return call(operands, basis_attributes(basis), aliases={4: 2} if F is None else {4: 2, 5: 3})

@@ -61,9 +61,19 @@ class Basis(NamedTuple):
         axes = range(len(self.shape))
         return tuple(tuple((1, 0) if b == a else (0, 0) for b in axes) for a in axes)
 
-    def index_terms(self, first: Int[Array, "*b d p"]) -> Int[Array, "*b d s p"]:
+    def base(self, xi: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
+        """The number of the first node along an axis, at places ξ in spacings from the window's first node. Its
+        derivative is zero."""
+        return jnp.floor(jax.lax.stop_gradient(xi) - (len(self.knots) - 2) / 2)
+
+    def offset(self, xi: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
+        """t, the distance from the middle of the places that have the same nodes, in spacings."""
+        return xi - self.base(xi) - (len(self.knots) - 1) / 2
+
+    def index_terms(self, xi: Float[Array, "*b d p"]) -> Int[Array, "*b d s p"]:
         """The share of each axis in the flat index of a node. Around a periodic axis the nodes after its last are its
         first ones."""
+        first = self.base(xi).astype(jnp.int32)
         along = first[..., None, :] + jnp.arange(len(self.knots), dtype=first.dtype)[:, None]
         if any(self.periodic):  # by whole numbers in the code: XLA divides by those in an array one by one
             axes = [along[..., a, :, :] for a in range(len(self.shape))]
@@ -98,17 +108,14 @@ def differentiated(terms: tuple[Term, ...]) -> tuple[Term, ...]:
 class Stencil(eqx.Module):
     """The nodes of each particle, s = order + 1 along each axis, with their weights and weight gradients.
 
-    Weights w_ip and gradients g_ip are products of one polynomial along each axis, in the offset t of the particle (see
+    Weights w_ip and gradients g_ip are products of one polynomial along each axis, of the particle's place ξ (see
     `Basis`): of w_ip the weights along the axes, of g_ip in direction a with the gradient's factor along a. The stencil
     is made at the positions x (updated Lagrangian), or once at the reference positions X (total Lagrangian), and
     gradients are with respect to those. Component first: the particle axis is last.
     """
 
-    first: Int[Array, "d p"]
-    """Number of the first node along each axis in the window, shape (d, p); meaningless for a particle that is not
-    `inside`."""
-    offset: Float[Array, "d p"]
-    """t, the distance from the middle of the places that have these nodes, in spacings, shape (d, p)."""
+    xi: Float[Array, "d p"]
+    """ξ, the place in spacings from the window's first node, shape (d, p); nodes are those of the particle's layer."""
     slope: Float[Array, ""]  # factor of the gradient's polynomials, 1/dx [1/m]
     inside: Bool[Array, "p"]  # whether the whole stencil of the particle lies in the window
     basis: Basis = eqx.field(static=True)  # the polynomials, and the window
@@ -156,7 +163,7 @@ class Stencil(eqx.Module):
 
     def of(self, particles: Int[Array, "s"]) -> "Stencil":
         """The stencil of some of the particles, by their numbers."""
-        names = "first", "offset", "inside", "own_derivatives", "flat", "radius"
+        names = "xi", "inside", "own_derivatives", "flat", "radius"
         arrays = {name: getattr(self, name) for name in names}
         return replace(self, **{name: a if a is None else a[..., particles] for name, a in arrays.items()})
 
@@ -166,8 +173,7 @@ class Stencil(eqx.Module):
         part = slice(axis, axis + 1)
         return replace(
             self,
-            first=self.first[part] % shape[0],
-            offset=self.offset[part],
+            xi=_around(self.basis, self.xi, (True,) * self.dim)[part],
             basis=self.basis._replace(shape=shape, periodic=self.basis.periodic[part]),
             own_derivatives=None if custom is None else custom[part],
             flat=None if flat is None else flat[part],
@@ -176,25 +182,26 @@ class Stencil(eqx.Module):
     @property
     def moment(self) -> Float[Array, "d p"]:
         """Diagonal of D_p = Σ_i w_ip (x_i − x_p)(x_i − x_p)ᵀ [m²], shape (d, p)."""
-        order, t = len(self.basis.knots) - 1, self.offset
+        order, t = len(self.basis.knots) - 1, self.basis.offset(self.xi)
         return ((0.5 - t) * (0.5 + t) if order == 1 else jnp.full_like(t, VARIANCE[order])) / self.slope**2
 
     @property
     def weights(self) -> Float[Array, "d s p"]:
         """Weights along each axis [-], shape (d, s, p)."""
-        return self.basis.polynomials((0, 0), self.offset)
+        return self.basis.polynomials((0, 0), self.basis.offset(self.xi))
 
     @property
     def weight_derivatives(self) -> Float[Array, "d s p"]:
         """The gradient's factors along each axis [1/m], shape (d, s, p)."""
         custom = self.own_derivatives
-        derivatives = self.basis.polynomials((1, 0), self.offset) * self.slope if custom is None else custom
+        t = self.basis.offset(self.xi)
+        derivatives = self.basis.polynomials((1, 0), t) * self.slope if custom is None else custom
         return derivatives if self.flat is None else jnp.where(self.flat[:, None], 0, derivatives)
 
     @property
     def index(self) -> Indices:
         """Flat index of each stencil node, shape (s^d, p)."""
-        return _tensor(jnp.add, list(self.basis.index_terms(self.first)))
+        return _tensor(jnp.add, list(self.basis.index_terms(self.xi)))
 
     @property
     def weight(self) -> Float[Array, "k p"]:
@@ -238,26 +245,31 @@ def make_stencil(
         layer: the number of the nodes' layer of each particle, shape (p,). Default: there is one.
     """
     dx = jnp.asarray(grid.spacing, x.dtype)
-    xi = components(x) / dx
-    offset = materialised(xi - jax.lax.stop_gradient(kernel.base(xi)) - kernel.order / 2)
-    first = first_nodes(kernel, grid, window, xi)
-    if layer is not None:
-        first = first.at[0].add(jnp.asarray(layer * grid.shape[0], jnp.int32))
     basis, custom = basis_of(kernel, grid, gradient.polynomials(kernel)), None
+    xi = places(basis, window, components(x) / dx)
+    if layer is not None:
+        xi = xi.at[0].add(jnp.asarray(layer * grid.shape[0], x.dtype))
+    xi = materialised(xi)
     if gradient.polynomials(kernel) is None:
         families = basis.slopes, basis.moments
-        custom = gradient.derivatives(*(basis._replace(slopes=c).polynomials((1, 0), offset) / dx for c in families))
+        custom = gradient.derivatives(
+            *(basis._replace(slopes=c).polynomials((1, 0), basis.offset(xi)) / dx for c in families)
+        )
     radius = components(x)[0] if grid.axisymmetric else None
-    return Stencil(first, offset, 1 / dx, in_window(kernel, grid, window, x), basis, custom, radius=radius)
+    return Stencil(xi, 1 / dx, in_window(kernel, grid, window, x), basis, custom, radius=radius)
 
 
-def first_nodes(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d p"]:
-    """Number of the first stencil node along each axis in the window, shape (d, p), for positions xi in spacings."""
-    first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window.astype(jnp.int32)[:, None]
-    if any(grid.periodic):
-        axes = zip(first, grid.shape, grid.periodic, strict=True)
-        first = jnp.stack([index % period if wraps else index for index, period, wraps in axes])
-    return first
+def places(basis: Basis, window: Int[Array, "d"], place: Float[Array, "d p"]) -> Float[Array, "d p"]:
+    """ξ of places in spacings from the origin, both (d, p). Along periodic axes the first node of each is one of the
+    window."""
+    xi = place - window.astype(place.dtype)[:, None]
+    return _around(basis, xi, basis.periodic) if any(basis.periodic) else xi
+
+
+def _around(basis: Basis, xi: Float[Array, "d p"], wraps: tuple[bool, ...]) -> Float[Array, "d p"]:
+    """Places moved by whole windows along some axes, so that the first node of each is one of the window."""
+    each = zip(xi, basis.base(xi), basis.shape, wraps, strict=True)
+    return jnp.stack([place - n * jnp.floor(first / n) if moved else place for place, first, n, moved in each])
 
 
 def _tensor(combine: Callable[[Array, Array], Array], factors: list[Array]) -> Array:

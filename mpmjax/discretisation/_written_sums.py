@@ -26,11 +26,11 @@ class Factors(NamedTuple):
     along: tuple[dict[Kind, Array], ...]  # the polynomials of each kind along each axis, shape (s, p)
 
     @classmethod
-    def of(cls, basis: Basis, first: Array, t: Array, terms: Sequence[Term]) -> "Factors":
+    def of(cls, basis: Basis, xi: Array, terms: Sequence[Term]) -> "Factors":
         """Factors of some terms."""
-        kinds = [dict.fromkeys(along) for along in zip(*terms, strict=True)]
+        kinds, t = [dict.fromkeys(along) for along in zip(*terms, strict=True)], basis.offset(xi)
         along = ({kind: basis.polynomials(kind, t[a]) for kind in some} for a, some in enumerate(kinds))
-        return cls(basis.index_terms(first), tuple(along))
+        return cls(basis.index_terms(xi), tuple(along))
 
 
 Pairs = Sequence[tuple[tuple[Term, ...], Array]]  # groups of terms and what particles give to each, (terms, c, p)

@@ -78,7 +78,7 @@ class ElasticPotential(eqx.Module):
     def term_energy(self, u: NodeVector | None) -> Float[Array, ""]:
         """The part of Φ(u) by the terms [J]; None for u = 0."""
         moved = self.displaced(u)
-        return sum((term.energy(moved) for term in self.terms), jnp.zeros((), self.stencil.offset.dtype))
+        return sum((term.energy(moved) for term in self.terms), jnp.zeros((), self.stencil.xi.dtype))
 
     def force(self, u: NodeVector | None) -> NodeVector:
         """f = −∂Φ/∂u [N], shape (n, d); None for u = 0, where f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""

@@ -262,18 +262,18 @@ def solve_particle_matrices(
     stencil = hessian.stencil
     factor = jnp.asarray(operator.factor * stencil.slope**2, b.dtype)
     args = without_flat(stencil, hessian.upper), operator.mass, factor, free, weight, active, x, b, limits
-    x, numbers = _solve(stencil.first, stencil.offset, *args, basis=stencil.basis)
+    x, numbers = _solve(stencil.xi, *args, basis=stencil.basis)
     rr, k, radius, breakdown, indefinite, correction, stalled, b_norm, x_norm = numbers
     flags = breakdown > 0, indefinite > 0
     return Iterate(x, rr, k.astype(jnp.int32), radius, *flags, correction, stalled > 0, b_norm, x_norm)
 
 
-def _call_solve(call: Any, first: Array, t: Array, *args: Array, basis: Basis) -> list[Array]:
+def _call_solve(call: Any, xi: Array, *args: Array, basis: Basis) -> list[Array]:
     """By a kernel, with memory for six vectors. Members of a batch, one after the other in a thread, take their own."""
-    n, dtype = args[-2].shape[-1], t.dtype
-    results = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, 9, 0 if first.ndim > 2 else 6 * n)]
-    aliases = {2 + len(args) - 3: 0}
-    return call([first, t, *args], basis_attributes(basis), results=results, aliases=aliases)[:2]
+    n, dtype = args[-2].shape[-1], xi.dtype
+    results = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, 9, 0 if xi.ndim > 2 else 6 * n)]
+    aliases = {1 + len(args) - 3: 0}
+    return call([xi, *args], basis_attributes(basis), results=results, aliases=aliases)[:2]
 
 
 @partial(
@@ -282,13 +282,13 @@ def _call_solve(call: Any, first: Array, t: Array, *args: Array, basis: Basis) -
     results=lambda *args, basis: (args[-2], jax.ShapeDtypeStruct((9,), args[-2].dtype)),
     call=_call_solve,
 )
-def _solve(first: Array, t: Array, *args: Array, basis: Basis) -> tuple[Array, Array]:
+def _solve(xi: Array, *args: Array, basis: Basis) -> tuple[Array, Array]:
     """`solve_particle_matrices`, written in JAX. Solves are not differentiated through their iterations."""
     upper, mass, factor, free, weight, active, x, b, limits = args
 
     def product(u: Array) -> tuple[Array, Array]:
         moved = jnp.where(free, u, 0).reshape(len(mass), -1)
-        force = resist_sum(first, t, upper, moved, basis=basis).reshape(-1)
+        force = resist_sum(xi, upper, moved, basis=basis).reshape(-1)
         return rest_of_product(force, u, mass, factor, free, weight, active)
 
     end = conjugate_residual(diagonal(product, weight, active), b, x, limits[0], limits[1])

@@ -211,8 +211,7 @@ def surface_image(
     place = grid.nodes(window) + (jnp.where(sloping, first + 0.5 - height, 0) * dx)[:, None] * normal
     stencil = make_stencil(BSpline(2), MLSGradient(), grid, window, place, layer=None if grid.layers == 1 else layer)
     behind = (height < first) & (height > -(order + 3) / 2) & sloping & stencil.inside & filled.any()
-    fields = (jnp.where(behind, field, 0) for field in (stencil.first, stencil.offset))  # elsewhere in the window too
-    stencil = replace(stencil, **dict(zip(("first", "offset"), fields, strict=True)))
+    stencil = replace(stencil, xi=jnp.where(behind, stencil.xi, 1))  # elsewhere in the window too
     number = jnp.nonzero(behind, size=-(-len(height) // _NEAR), fill_value=len(height))[0].astype(jnp.int32)
     near, fits = _Rows(number, stencil.of(number), height[number], normal[number]), behind.sum() <= len(number)
     ones = jnp.ones_like(height)

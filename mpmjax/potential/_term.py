@@ -26,7 +26,7 @@ class Displacement:
     @cached_property
     def nodes(self) -> NodeVector:
         """u_i, shape (n, d)."""
-        return jnp.zeros((self.size, self.stencil.dim), self.stencil.offset.dtype)
+        return jnp.zeros((self.size, self.stencil.dim), self.stencil.xi.dtype)
 
     @cached_property
     def at_particles(self) -> tuple[Float[Array, "d p"], Float[Array, "k k p"]]:
@@ -53,7 +53,7 @@ class Forces(NamedTuple):
 
     def product(self, moved: Displacement) -> Float[Array, ""]:
         """Their work at a displacement [J], or power at a velocity [W]."""
-        total = jnp.zeros((), moved.stencil.offset.dtype) if self.nodes is None else (self.nodes * moved.nodes).sum()
+        total = jnp.zeros((), moved.stencil.xi.dtype) if self.nodes is None else (self.nodes * moved.nodes).sum()
         for part, at in () if self[1:] == (None, None) else zip(self[1:], moved.at_particles, strict=True):
             total = total if part is None else total + (part * at).sum()
         return total
@@ -66,7 +66,7 @@ def scattered(forces: Sequence[Forces], stencil: Stencil, size: int) -> NodeVect
     parts = ([a for a in field if a is not None] for field in zip(*forces, strict=True))
     nodes, value, slopes = (reduce(jnp.add, part) if part else None for part in parts)
     if value is None and slopes is None:
-        return jnp.zeros((size, stencil.dim), stencil.offset.dtype) if nodes is None else nodes
+        return jnp.zeros((size, stencil.dim), stencil.xi.dtype) if nodes is None else nodes
     total = scatter(stencil, value, slopes, size)
     return total if nodes is None else total + nodes
 

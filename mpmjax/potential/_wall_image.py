@@ -171,12 +171,13 @@ def wall_image(
 
         def middle() -> Array:
             force = moment = jnp.zeros_like(volume)
+            first = along.basis.base(along.xi)[0].astype(jnp.int32)
             for n, slope in enumerate(along.weight_derivatives[0]):
-                node = along.first[0] + n
+                node = first + n
                 part = jnp.where(inward * (node - base) <= 0, slope, 0)
                 force, moment = force + part, moment + part * sign * (node.astype(place.dtype) - place)
-            total, first = jnp.stack([force, moment]) @ volume  # a product, of which XLA makes vectors
-            return jnp.clip(jnp.where(total == 0, 0, first / jnp.where(total == 0, 1, total)), -0.02, 0.02)
+            total, turn = jnp.stack([force, moment]) @ volume  # a product, of which XLA makes vectors
+            return jnp.clip(jnp.where(total == 0, 0, turn / jnp.where(total == 0, 1, total)), -0.02, 0.02)
 
         aside = jnp.abs(2 * place - jnp.round(2 * place)) > 2 * near
         shift = jax.lax.cond(aside, middle, lambda: jnp.zeros((), volume.dtype))

@@ -16,7 +16,7 @@ from equinox.internal import unvmap_any
 
 from mpmjax._types import Array, Bool, Float, Int, ParticleVector, Scalar, components, particle_first
 from mpmjax.autodiff import custom_derivative
-from mpmjax.discretisation import BSpline, Grid, basis_of, first_nodes
+from mpmjax.discretisation import BSpline, Grid, basis_of, places
 from mpmjax.native import backend
 from mpmjax.state import AttachedPoints, Particles, Scene, State, is_foreign
 
@@ -154,8 +154,9 @@ def _places(order: Order) -> Order:
 def cells_of(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Int[Array, "p"]:
     """The C-order index of the first node of each particle's stencil, shape (p,): particles with the same one share all
     nodes. Without meaning outside of the window."""
-    first = first_nodes(kernel, grid, window, components(x) / grid.spacing)
-    return basis_of(kernel, grid).index_terms(first)[:, 0].sum(axis=0, dtype=jnp.int32)
+    basis = basis_of(kernel, grid)
+    xi = places(basis, window, components(x) / grid.spacing)
+    return basis.index_terms(xi)[:, 0].sum(axis=0, dtype=jnp.int32)
 
 
 @partial(custom_derivative, kernel="order")
