@@ -252,10 +252,9 @@ def test_in_the_total_description_a_rollout_builds_no_custom_in_its_steps():
     assert counted(description=mpm.TotalLagrangian())["floor"] == 0
 
 
-def test_only_along_periodic_axes_are_remainders_taken():
+def test_around_periodic_axes_no_remainders_are_taken():
     """A CPU divides whole numbers one by one: that was two fifths of the gradient of an explicit step."""
-    taken = [counted(periodic=periodic)["rem"] for periodic in (False, (True, False), True)]
-    assert taken == [0, 1, 2]
+    assert not any(counted(periodic=periodic)["rem"] for periodic in (False, (True, False), True))
 
 
 SNOW = mpm.Snow()

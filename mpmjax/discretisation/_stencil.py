@@ -39,9 +39,9 @@ Term = tuple[Kind, ...]  # a polynomial along each axis, whose product is one nu
 class Basis(NamedTuple):
     """Numbering of nodes, and polynomials, fixed in a program.
 
-    The i-th node along an axis from the first one on has the polynomials
-    Σ_k c_ik (t − τ_i)^k in the offset t, around knots τ at which small weights are small by a power and not by a
-    difference."""
+    The i-th node along an axis from the first one on has the polynomials Σ_k c_ik (t − τ_i)^k in the offset t, around
+    knots τ at which small weights are small by a power and not by a difference. ξ is a place in spacings from the
+    window's first node."""
 
     shape: tuple[int, ...]  # nodes along each axis
     periodic: tuple[bool, ...]  # whether each axis is
@@ -62,13 +62,18 @@ class Basis(NamedTuple):
         return tuple(tuple((1, 0) if b == a else (0, 0) for b in axes) for a in axes)
 
     def base(self, xi: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
-        """The number of the first node along an axis, at places ξ in spacings from the window's first node. Its
-        derivative is zero."""
+        """The number of the first node along an axis, without a derivative."""
         return jnp.floor(jax.lax.stop_gradient(xi) - (len(self.knots) - 2) / 2)
 
     def offset(self, xi: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
         """t, the distance from the middle of the places that have the same nodes, in spacings."""
         return xi - self.base(xi) - (len(self.knots) - 1) / 2
+
+    def contains(self, xi: Float[Array, "d p"]) -> Bool[Array, "p"]:
+        """Whether all nodes of a particle lie in the window, shape (p,)."""
+        first, shape = self.base(xi), jnp.asarray(self.shape, dtype=xi.dtype)[:, None]
+        along_axis = jnp.asarray(self.periodic)[:, None] | ((first >= 0) & (first + len(self.knots) <= shape))
+        return reduce(jnp.logical_and, along_axis)
 
     def index_terms(self, xi: Float[Array, "*b d p"]) -> Int[Array, "*b d s p"]:
         """The share of each axis in the flat index of a node. Around a periodic axis the nodes after its last are its
@@ -182,8 +187,10 @@ class Stencil(eqx.Module):
     @property
     def moment(self) -> Float[Array, "d p"]:
         """Diagonal of D_p = Σ_i w_ip (x_i − x_p)(x_i − x_p)ᵀ [m²], shape (d, p)."""
-        order, t = len(self.basis.knots) - 1, self.basis.offset(self.xi)
-        return ((0.5 - t) * (0.5 + t) if order == 1 else jnp.full_like(t, VARIANCE[order])) / self.slope**2
+        if (order := len(self.basis.knots) - 1) > 1:
+            return jnp.full_like(self.xi, VARIANCE[order]) / self.slope**2
+        t = self.basis.offset(self.xi)
+        return (0.5 - t) * (0.5 + t) / self.slope**2
 
     @property
     def weights(self) -> Float[Array, "d s p"]:
@@ -218,11 +225,8 @@ class Stencil(eqx.Module):
 @eqx.filter_jit
 def in_window(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Bool[Array, "p"]:
     """Whether the whole stencil of a particle at x lies in the window, shape (p,)."""
-    base = kernel.base(components(x) / grid.spacing)
-    first = base - window.astype(base.dtype)[:, None]  # in floats: what is far outside overflows an integer
-    shape = jnp.asarray(grid.shape, dtype=base.dtype)[:, None]
-    along_axis = jnp.asarray(grid.periodic)[:, None] | ((first >= 0) & (first + kernel.order < shape))
-    return reduce(jnp.logical_and, along_axis)
+    basis = basis_of(kernel, grid)
+    return basis.contains(places(basis, window, components(x) / grid.spacing))
 
 
 def make_stencil(
@@ -247,6 +251,7 @@ def make_stencil(
     dx = jnp.asarray(grid.spacing, x.dtype)
     basis, custom = basis_of(kernel, grid, gradient.polynomials(kernel)), None
     xi = places(basis, window, components(x) / dx)
+    inside = basis.contains(xi)
     if layer is not None:
         xi = xi.at[0].add(jnp.asarray(layer * grid.shape[0], x.dtype))
     xi = materialised(xi)
@@ -256,7 +261,7 @@ def make_stencil(
             *(basis._replace(slopes=c).polynomials((1, 0), basis.offset(xi)) / dx for c in families)
         )
     radius = components(x)[0] if grid.axisymmetric else None
-    return Stencil(xi, 1 / dx, in_window(kernel, grid, window, x), basis, custom, radius=radius)
+    return Stencil(xi, 1 / dx, inside, basis, custom, radius=radius)
 
 
 def places(basis: Basis, window: Int[Array, "d"], place: Float[Array, "d p"]) -> Float[Array, "d p"]:
