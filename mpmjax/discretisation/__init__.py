@@ -21,8 +21,8 @@ from mpmjax.discretisation._stencil import (
     in_section as in_section,
     in_space as in_space,
     in_window as in_window,
+    locate as locate,
     make_stencil as make_stencil,
-    places as places,
 )
 from mpmjax.discretisation._sums import gather as gather, scatter as scatter
 from mpmjax.discretisation._transfer import (

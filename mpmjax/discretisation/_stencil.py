@@ -69,12 +69,6 @@ class Basis(NamedTuple):
         """t, the distance from the middle of the places that have the same nodes, in spacings."""
         return xi - self.base(xi) - (len(self.knots) - 1) / 2
 
-    def contains(self, xi: Float[Array, "d p"]) -> Bool[Array, "p"]:
-        """Whether all nodes of a particle lie in the window, shape (p,)."""
-        first, shape = self.base(xi), jnp.asarray(self.shape, dtype=xi.dtype)[:, None]
-        along_axis = jnp.asarray(self.periodic)[:, None] | ((first >= 0) & (first + len(self.knots) <= shape))
-        return reduce(jnp.logical_and, along_axis)
-
     def index_terms(self, xi: Float[Array, "*b d p"]) -> Int[Array, "*b d s p"]:
         """The share of each axis in the flat index of a node. Around a periodic axis the nodes after its last are its
         first ones."""
@@ -225,8 +219,7 @@ class Stencil(eqx.Module):
 @eqx.filter_jit
 def in_window(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Bool[Array, "p"]:
     """Whether the whole stencil of a particle at x lies in the window, shape (p,)."""
-    basis = basis_of(kernel, grid)
-    return basis.contains(places(basis, window, components(x) / grid.spacing))
+    return locate(basis_of(kernel, grid), window, components(x) / grid.spacing)[1]
 
 
 def make_stencil(
@@ -250,8 +243,7 @@ def make_stencil(
     """
     dx = jnp.asarray(grid.spacing, x.dtype)
     basis, custom = basis_of(kernel, grid, gradient.polynomials(kernel)), None
-    xi = places(basis, window, components(x) / dx)
-    inside = basis.contains(xi)
+    xi, inside = locate(basis, window, components(x) / dx)
     if layer is not None:
         xi = xi.at[0].add(jnp.asarray(layer * grid.shape[0], x.dtype))
     xi = materialised(xi)
@@ -264,11 +256,16 @@ def make_stencil(
     return Stencil(xi, 1 / dx, inside, basis, custom, radius=radius)
 
 
-def places(basis: Basis, window: Int[Array, "d"], place: Float[Array, "d p"]) -> Float[Array, "d p"]:
-    """ξ of places in spacings from the origin, both (d, p). Along periodic axes the first node of each is one of the
-    window."""
+def locate(
+    basis: Basis, window: Int[Array, "d"], place: Float[Array, "d p"]
+) -> tuple[Float[Array, "d p"], Bool[Array, "p"]]:
+    """ξ of places in spacings from the origin, both (d, p), and whether all nodes of each lie in the window, (p,). The
+    first one does along periodic axes."""
     xi = place - window.astype(place.dtype)[:, None]
-    return _around(basis, xi, basis.periodic) if any(basis.periodic) else xi
+    xi = _around(basis, xi, basis.periodic) if any(basis.periodic) else xi
+    first, shape = basis.base(xi), jnp.asarray(basis.shape, dtype=xi.dtype)[:, None]
+    along_axis = jnp.asarray(basis.periodic)[:, None] | ((first >= 0) & (first + len(basis.knots) <= shape))
+    return xi, reduce(jnp.logical_and, along_axis)
 
 
 def _around(basis: Basis, xi: Float[Array, "d p"], wraps: tuple[bool, ...]) -> Float[Array, "d p"]:

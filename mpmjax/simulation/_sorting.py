@@ -16,7 +16,7 @@ from equinox.internal import unvmap_any
 
 from mpmjax._types import Array, Bool, Float, Int, ParticleVector, Scalar, components, particle_first
 from mpmjax.autodiff import custom_derivative
-from mpmjax.discretisation import BSpline, Grid, basis_of, places
+from mpmjax.discretisation import BSpline, Grid, basis_of, locate
 from mpmjax.native import backend
 from mpmjax.state import AttachedPoints, Particles, Scene, State, is_foreign
 
@@ -155,7 +155,7 @@ def cells_of(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVe
     """The C-order index of the first node of each particle's stencil, shape (p,): particles with the same one share all
     nodes. Without meaning outside of the window."""
     basis = basis_of(kernel, grid)
-    xi = places(basis, window, components(x) / grid.spacing)
+    xi, _ = locate(basis, window, components(x) / grid.spacing)
     return basis.index_terms(xi)[:, 0].sum(axis=0, dtype=jnp.int32)
 
 
