@@ -160,6 +160,7 @@ class AbstractSpringContact(AbstractContact):
 
     def springs(self, active: Array) -> AbstractSpring:
         held = active & self.near
+        # at θ of the displacement the gap θ g⁰ has become θ g¹: with k/θ the force is −k g¹
         return self.spread(self.share * jnp.where(held, self.gap, 0), jnp.where(held, self.stiffness / self.share, 0))
 
     def spring_gap(self, held: "ConstrainedNodes") -> Array:

@@ -103,11 +103,11 @@ class ConjugateResidual(AbstractInnerProductSolver):
             else:
                 active, multiply = active_blocks(jnp.ones(size, bool)), flat(state.mv)
                 product = lambda u: ((image := multiply(u)) / weight, (u * image).sum())  # noqa: E731
-            limits = b / weight, x, rtol, self.max_steps
+            system = b / weight, x, rtol, self.max_steps
             if self.increment_rtol is None and isinstance(state, ImplicitOperator) and state.is_particle_matrices:
-                end = solve_particle_matrices(state, weight, active, *limits)
+                end = solve_particle_matrices(state, weight, active, *system)
             else:
-                end = conjugate_residual(diagonal(product, weight, active), *limits, self.increment_rtol)
+                end = conjugate_residual(diagonal(product, weight, active), *system, self.increment_rtol)
         result, stats = _outcome(end, rtol, self.max_steps)
         return unravel(end.x.reshape(-1, size)[0]), result, stats
 
