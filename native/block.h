@@ -83,7 +83,7 @@ constexpr auto before_of(std::integer_sequence<int, lane...>) {
 }
 
 // The first nodes of particles along an axis, ⌊ξ − (s − 2)/2⌋, and the offsets t from the middle of the places that have
-// these. What is beyond the integers is far from the window, and what is no number on its first node, as XLA has it.
+// these. Beyond 2³⁰ they have no meaning, and what is no number is on the first node, as XLA has it.
 template <int s, class T>
 MPMJAX_INLINE Simd<T> first_of(Simd<T> place) {
   constexpr T kFar = 1 << 30;
@@ -245,7 +245,7 @@ MPMJAX_NOINLINE void read_rows(const T* from, int64_t particles, int count, int 
   to_rows<T, kLanes>(columns, rows);
 }
 
-// A differential along dt is a sum over the axes, of the same sums with derivatives along one of them: a pass for each.
+// A differential along dξ is a sum over the axes, of the same sums with derivatives along one of them: a pass for each.
 // The sum itself is one pass, with no derivative.
 template <int d, class T>
 MPMJAX_INLINE int passes(const Stencils<T>& stencils) {

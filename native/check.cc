@@ -1,5 +1,5 @@
 // Checks the sums against those of one_thread.h in double, on random problems: all dimensions, orders, precisions and
-// numbers of columns, batches, periodic axes, indices beyond the window and as large as integers are, offsets that are
+// numbers of columns, batches, periodic axes, indices beyond the window and as large as integers are, places that are
 // not finite, no particle and one. Any number of threads must give the same bits. Arrays end where they end, so that a
 // sanitizer sees what reads or writes beyond; native/check compiles this with each of them.
 
@@ -45,7 +45,8 @@ void place(const Stencils<T>& stencils, const Shape& sh, Random& random) {
   const auto& basis = stencils.basis;
   const int32_t along = int32_t(sh.along), beyond = sh.places > kInside ? 2 : 0;
   std::uniform_int_distribution<int32_t> inside(-beyond, along - sh.s + beyond), around(-beyond, along - 1 + beyond);
-  std::uniform_int_distribution<int32_t> any(-(1 << 20), 1 << 20);
+  const int32_t far = sizeof(T) == 8 ? 1 << 30 : 1 << 20;  // where a float has halves still, which a double rounds alike
+  std::uniform_int_distribution<int32_t> any(-far, far);
   std::uniform_real_distribution<float> half(-0.5f, 0.5f);
   for (int64_t i = 0; i < sh.batch * sh.d * sh.particles; ++i) {
     const int64_t p = i % sh.particles, side = along - sh.s + 1;
@@ -96,7 +97,7 @@ Example<Problem<T>> check(const std::string& what, const Shape& sh, int64_t colu
   return tested;
 }
 
-// The three sums, of all that may be given: value and gradients, value alone, gradients alone; along dt; gradients with a
+// The three sums, of all that may be given: value and gradients, value alone, gradients alone; along dξ; gradients with a
 // column less. No gather beside the last pull.
 template <class T>
 void check_sums(const Shape& sh, const Pools& pools) {

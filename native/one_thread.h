@@ -31,8 +31,8 @@ struct alignas(c * sizeof(T) % 16 == 0 ? 16 : c * sizeof(T) % 8 == 0 ? 8 : sizeo
   T at[c];
 };
 
-// The first node of a particle along an axis, ⌊ξ − (s − 2)/2⌋. What is beyond the integers is far from the window, and
-// what is no number on its first node, as XLA has it.
+// The first node of a particle along an axis, ⌊ξ − (s − 2)/2⌋, without meaning beyond 2³⁰. What is no number is on the
+// window's first node, as XLA has it.
 template <int s, class T>
 int32_t first_of(T place) {
   constexpr T kFar = 1 << 30;
@@ -83,7 +83,7 @@ struct Particle {
     }
   }
 
-  // The polynomials, with derivatives along some axes, a bit each, times dt if there is one.
+  // The polynomials, with derivatives along some axes, a bit each, times dξ if there is one.
   void evaluate(const Stencils<T>& from, unsigned differentiated = 0) {
     MPMJAX_UNROLL for (int a = 0; a < d; ++a) {
       const int64_t at = a * from.particles + number;
@@ -245,7 +245,7 @@ Pulled<T, d, a> pull_from(const Particle<T, d, s>& at, const Particle<T, d, s>& 
   return sums;
 }
 
-// A differential along dt is a sum over the axes, of the same sums with derivatives along one of them.
+// A differential along dξ is a sum over the axes, of the same sums with derivatives along one of them.
 template <class T, int d, class Run>
 void over_passes(const Stencils<T>& stencils, const Run& run) {
   if (stencils.change == nullptr) return run(0u, 0);

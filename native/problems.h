@@ -6,7 +6,7 @@
 //   scatter  f_i  = Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b)
 //   gather   a_p  = Σ_i w_ip f_i,   a_p,b = Σ_i g_ip,b f_i
 //   average  m_i, the last column of a scatter, and the others divided by it
-//   pull     ∂B/∂t,   B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b)
+//   pull     ∂B/∂ξ,   B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b)
 //   resist   the scatter of K_p times the gather's gradients, with a symmetric matrix K_p for each particle
 //
 // Weights are products of one polynomial along each axis, of the offset t of the particle's place ξ; of a gradient's the

@@ -102,7 +102,7 @@ def test_sums_agree(one_by_one, d, s, c, dtype):
 @NEEDS_COMPILER
 @pytest.mark.parametrize("d", [1, *thorough(2, 3)])
 def test_sums_agree_whatever_is_given(one_by_one, d):
-    """Of the value, gradients, or both, of fewer columns too; of squares, moved along dt, and in a batch."""
+    """Of the value, gradients, or both, of fewer columns too; of squares, moved along dξ, and in a batch."""
     args, basis, c = problem(d, 3, 2, 21, "float64"), basis_for(d, 3), 2
 
     def each(xi, *floats):

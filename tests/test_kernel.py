@@ -157,6 +157,24 @@ def test_periodic_indices_wrap(kernel, d):
     assert (np.abs(distance) <= DX * (kernel.order + 1) / 2 + 1e-12).all()
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize(
+    "n", [41, 49, 64]
+)  # XLA divides by these by their reciprocals: 41/41 in float32 is less than 1
+def test_beside_a_seam_nodes_are_those_of_the_window_and_of_the_layer(n, dtype):
+    """However near to where the first node jumps, and however many windows away."""
+    kernel, grid = mpm.BSpline(2), mpm.Grid((n,), 1.0, periodic=True, layers=4)
+    seam = np.asarray(0.5 + n * np.arange(-2.0, 3.0), dtype)
+    x = np.concatenate([seam, np.nextafter(seam, -n), np.nextafter(seam, 3 * n), seam + np.asarray(0.7, dtype)])[
+        :, None
+    ]
+    for layer in (0, 3):
+        layers = np.full(len(x), layer)
+        make = lambda x, layers=layers: make_stencil(kernel, mpm.MLSGradient(), grid, grid.window(x), x, layer=layers)  # noqa: E731
+        index = jax.jit(lambda x, make=make: make(x).index)(jnp.asarray(x))
+        np.testing.assert_array_equal(index // n, layer)
+
+
 @pytest.mark.parametrize("kernel", **ids(KERNELS))
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 @pytest.mark.parametrize("origin", [0, -3])

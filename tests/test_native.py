@@ -46,7 +46,7 @@ def problem(d, s, c, p, dtype, seed=0, *, wild=True, side=SIDE):
     rng = np.random.default_rng(seed)
     first = rng.integers(-wild, side - s + 1 + wild, size=(d, p)).astype("int32")
     if wild and p > 3:
-        first[:, 3] = rng.integers(-(2**20), 2**20, size=d)
+        first[:, 3] = rng.integers(-(2**30), 2**30, size=d)
     xi = (first + rng.uniform(0, 1, (d, p)) + (s - 2) / 2).astype(dtype)
     given, nodes = (rng.normal(size=shape).astype(dtype) for shape in ((d + 1, c, p), (side**d, c)))
     return tuple(jnp.asarray(a, a.dtype) for a in (xi, given, nodes))  # without a dtype: a program each
@@ -512,19 +512,20 @@ def test_a_particle_that_is_not_finite_spoils_its_own_nodes_alone(choose):
 def test_wrong_arrays_are_refused(what):
     """By the library itself: what does not fit each other ends in an error, not in a read beyond it."""
     xi, _, nodes = problem(2, 3, 3, 10, "float32")
-    told = basis_attributes(basis_for(2, 3))
+    change = xi
+    told = basis_attributes(basis_for(2, 3)) | {"present": np.ones(3, np.int64)}
     message = {"an array": "shapes do not fit", "an attribute": "is missing", "coefficients": "of both families"}[what]
     match what:
         case "an array":
-            nodes = nodes[:, 0]
+            change = xi[:, :9]
         case "an attribute":
             told.pop("knots")
         case "coefficients":
             told["slopes"] = told["slopes"][:-1]
-    bad = jax.ffi.ffi_call("mpmjax_gather", [jax.ShapeDtypeStruct((3, 10), "float32")] * 3)
+    bad = jax.ffi.ffi_call("mpmjax_gather", [jax.ShapeDtypeStruct(a, "float32") for a in ((3, 10), (2, 3, 10))])
     assert mpm.native.backend().name == "native"
     with pytest.raises(Exception, match=message):
-        jax.block_until_ready(jax.jit(lambda *a: bad(*a, **told))(xi, nodes))
+        jax.block_until_ready(jax.jit(lambda *a: bad(*a, **told))(xi, change, nodes))
 
 
 @NEEDS_LIBRARY

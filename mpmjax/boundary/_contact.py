@@ -5,7 +5,7 @@ along a contact plane, of a contact of your own. Its gap g and normal impulse r 
 g is the velocity with which the gap opens, for faces and bodies the gap with its spring's length. The *active set* is
 the mask of the places that are held shut, one for each contact.
 
-It is guessed as the places that the velocity v^n, or the explicit v*, closes. Then in sweeps: solve with
+It is guessed as the places that the solve's guess, or the explicit velocity v*, closes. Then in sweeps: solve with
 the active set held; release the places that would have to pull, hold those that are entered; stop when nothing changes,
 or `SWEEPS` sets were given up. The conditions that are violated by then are counted in `ContactInfo.violations`. The
 derivative is that of a solve with the last set held, and does not exist where the set changes. An explicit step's force
@@ -248,7 +248,8 @@ class ConstrainedNodes(eqx.Module):
         springs = [term for contact, active in pairs if (term := contact.springs(active)) is not None]
         if not springs:
             return residual
-        return residual - nodes.dt * nodes.potential.on_nodes([term.force(self.moved) for term in springs])
+        moved = self.moved  # of which all springs share one gather
+        return residual - nodes.dt * nodes.potential.on_nodes([term.force(moved) for term in springs])
 
     def impulse(self, residual: NodeVector) -> NodeVector:
         """The impulse of walls, planes and contacts, without colliders, on each true node [kg m/s], shape (n, d)."""

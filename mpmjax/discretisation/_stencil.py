@@ -114,7 +114,8 @@ class Stencil(eqx.Module):
     """
 
     xi: Float[Array, "d p"]
-    """ξ, the place in spacings from the window's first node, shape (d, p); nodes are those of the particle's layer."""
+    """ξ, the place in spacings from the window's first node, shape (d, p). Along periodic axes the stencil's first node
+    is one of the window; before layer k lie k windows along the first axis."""
     slope: Float[Array, ""]  # factor of the gradient's polynomials, 1/dx [1/m]
     inside: Bool[Array, "p"]  # whether the whole stencil of the particle lies in the window
     basis: Basis = eqx.field(static=True)  # the polynomials, and the window
@@ -245,7 +246,11 @@ def make_stencil(
     basis, custom = basis_of(kernel, grid, gradient.polynomials(kernel)), None
     xi, inside = locate(basis, window, components(x) / dx)
     if layer is not None:
-        xi = xi.at[0].add(jnp.asarray(layer * grid.shape[0], x.dtype))
+        start = layer * grid.shape[0]
+        beyond = start + grid.shape[0] - (0 if grid.periodic[0] else kernel.order) + (kernel.order - 1) / 2
+        most = np.nextafter(beyond.astype(x.dtype), 0)  # what rounds up has its nodes in another layer
+        place = xi[0] + jnp.asarray(start, x.dtype)
+        xi = xi.at[0].set(jnp.where(place > most, most, place))
     xi = materialised(xi)
     if gradient.polynomials(kernel) is None:
         families = basis.slopes, basis.moments
@@ -259,8 +264,8 @@ def make_stencil(
 def locate(
     basis: Basis, window: Int[Array, "d"], place: Float[Array, "d p"]
 ) -> tuple[Float[Array, "d p"], Bool[Array, "p"]]:
-    """ξ of places in spacings from the origin, both (d, p), and whether all nodes of each lie in the window, (p,). The
-    first one does along periodic axes."""
+    """ξ of places in spacings from the origin, both (d, p), and whether all nodes of each lie in the window, (p,). They
+    are moved by whole windows along periodic axes, until the first node does."""
     xi = place - window.astype(place.dtype)[:, None]
     xi = _around(basis, xi, basis.periodic) if any(basis.periodic) else xi
     first, shape = basis.base(xi), jnp.asarray(basis.shape, dtype=xi.dtype)[:, None]
@@ -270,8 +275,15 @@ def locate(
 
 def _around(basis: Basis, xi: Float[Array, "d p"], wraps: tuple[bool, ...]) -> Float[Array, "d p"]:
     """Places moved by whole windows along some axes, so that the first node of each is one of the window."""
-    each = zip(xi, basis.base(xi), basis.shape, wraps, strict=True)
-    return jnp.stack([place - n * jnp.floor(first / n) if moved else place for place, first, n, moved in each])
+
+    def moved(place: Array, n: int) -> Array:
+        place = place - n * jnp.floor(basis.base(place) / n)
+        # by rounding: 41/41 is less than one in float32, as XLA divides, and what is just below a seam is on it
+        place = jnp.where(basis.base(place) < n, place, place - n)
+        return jnp.where(place < least, least, place)
+
+    least, each = (len(basis.knots) - 2) / 2, zip(xi, basis.shape, wraps, strict=True)
+    return jnp.stack([moved(place, n) if wrapped else place for place, n, wrapped in each])
 
 
 def _tensor(combine: Callable[[Array, Array], Array], factors: list[Array]) -> Array:
