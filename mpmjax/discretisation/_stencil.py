@@ -248,7 +248,7 @@ def make_stencil(
     if layer is not None:
         start = layer * grid.shape[0]
         beyond = start + grid.shape[0] - (0 if grid.periodic[0] else kernel.order) + (kernel.order - 1) / 2
-        most = np.nextafter(beyond.astype(x.dtype), 0)  # what rounds up has its nodes in another layer
+        most = np.nextafter(beyond.astype(x.dtype), 0)  # beyond it, by rounding or outside, are nodes of another layer
         place = xi[0] + jnp.asarray(start, x.dtype)
         xi = xi.at[0].set(jnp.where(place > most, most, place))
     xi = materialised(xi)
