@@ -82,8 +82,8 @@ constexpr auto before_of(std::integer_sequence<int, lane...>) {
   return std::integer_sequence<int, (lane > 0 ? lane - 1 : 0)...>();
 }
 
-// The first nodes of particles along an axis, ⌊ξ − (s − 2)/2⌋, and the offsets t from the middle of the places that have
-// these. Beyond 2³⁰ they have no meaning, and what is no number is on the first node, as XLA has it.
+// The first nodes of particles along an axis, ⌊ξ − (s − 2)/2⌋, without meaning beyond 2³⁰. What is no number is on the
+// window's first node, as XLA has it.
 template <int s, class T>
 MPMJAX_INLINE Simd<T> first_of(Simd<T> place) {
   constexpr T kFar = 1 << 30;
@@ -93,13 +93,12 @@ MPMJAX_INLINE Simd<T> first_of(Simd<T> place) {
   const Simd<T> whole = __builtin_convertvector(__builtin_convertvector(near, Index), Simd<T>);
   return whole > near ? whole - 1 : whole;
 }
-template <int s, class T>
-MPMJAX_INLINE Simd<T> offset_of(Simd<T> place) { return place - first_of<s, T>(place) - T(s - 1) / 2; }
 
 // The weights of a block and their slopes along each axis.
 template <class T, int d, int s>
 struct Block {
   int32_t index[d][s][kBlock];
+  T offset[d][kBlock];  // from the middle of the places that have the same nodes
   T weights[d][s][kBlock];
   T slopes[d][s][kBlock];
   // The last axis' of each particle as rows of four.
@@ -110,20 +109,18 @@ struct Block {
   int32_t least[kBlock], most[kBlock];
   int32_t least_beyond[kBlock], most_beyond[kBlock];
 
-  // The polynomials, with derivatives along some axes, a bit each, times dξ if there is one; those of no particle are
-  // zero. The index is read by `find_range`.
+  // The polynomials at the offsets that `find_range` found, with derivatives along some axes, a bit each, times dξ if
+  // there is one; those of no particle are zero.
   MPMJAX_NOINLINE void evaluate(const Stencils<T>& from, int64_t first, int count, unsigned differentiated = 0) {
     for (int a = 0; a < d; ++a) {
-      T t[kBlock], dt[kBlock];
-      copy(from.place + a * from.particles + first, count, t);
-      for (int q = 0; q < kBlock; q += kSimdLanes<T>) store(t + q, offset_of<s, T>(load_as<Simd<T>>(t + q)));
+      T dt[kBlock];
       if (!(differentiated >> a & 1)) {
-        set<0>(from.basis, a, t, count, nullptr);
+        set<0>(from.basis, a, offset[a], count, nullptr);
       } else if (from.change == nullptr) {
-        set<1>(from.basis, a, t, count, nullptr);
+        set<1>(from.basis, a, offset[a], count, nullptr);
       } else {
         copy(from.change + a * from.particles + first, count, dt);
-        set<1>(from.basis, a, t, count, dt);
+        set<1>(from.basis, a, offset[a], count, dt);
       }
     }
   }
@@ -152,20 +149,21 @@ struct Block {
     }
   }
 
-  // The index terms of an axis, (first + i) stride or around a periodic one. They wrap as 32-bit integers do: those of
-  // a particle outside of the window, or of none, have no meaning, and may be any number.
-  MPMJAX_INLINE void read_index(const Stencils<T>& from, int a, int64_t first, int count) {
+  // The offsets and the index terms of an axis, (first + i) stride or around a periodic one. Terms wrap as 32-bit
+  // integers do: those of a particle outside of the window, or of none, have no meaning, and may be any number.
+  MPMJAX_INLINE void read_place(const Stencils<T>& from, int a, int64_t first, int count) {
     T place[kBlock];
     int32_t begin[kBlock];
     copy(from.place + a * from.particles + first, count, place);
     for (int q = 0; q < kBlock; q += kSimdLanes<T>) {
-      const Simd<T> whole = first_of<s, T>(load_as<Simd<T>>(place + q));
+      const Simd<T> xi = load_as<Simd<T>>(place + q), whole = first_of<s, T>(xi);
+      store(offset[a] + q, xi - whole - T(s - 1) / 2);
       store(begin + q, __builtin_convertvector(whole, LanesOf<float, kSimdLanes<T>>));
     }
     const uint32_t stride = static_cast<uint32_t>(from.basis.strides[a]);
-    const BlockUint node = load_as<BlockUint>(begin);
+    BlockUint term = load_as<BlockUint>(begin) * stride;
 #pragma GCC unroll 4
-    for (int i = 0; i < s; ++i) store(index[a][i], (node + i) * stride);
+    for (int i = 0; i < s; ++i, term += stride) store(index[a][i], term);
     if (from.basis.periodic[a]) wrap_index(from.basis.shape[a], stride, begin, index[a]);
   }
 
@@ -193,7 +191,7 @@ struct Block {
     BlockInt large = {}, bent = {}, low_sum = {}, high_sum = {};
 #pragma GCC unroll 3
     for (int a = d - 1; a >= 0; --a) {
-      read_index(from, a, first, count);
+      read_place(from, a, first, count);
       BlockInt low = load_as<BlockInt>(index[a][0]), high = load_as<BlockInt>(index[a][s - 1]);
       for (int i = 0; i < s && from.basis.periodic[a]; ++i) {
         const BlockInt term = load_as<BlockInt>(index[a][i]);
@@ -228,7 +226,7 @@ struct Block {
     store(to_most, all != 0 ? BlockInt{} + INT32_MAX : high);
   }
 
-  // The flat index of the j-th node of a row, in C order of the axes before the last. It wraps, as read_index says.
+  // The flat index of the j-th node of a row, in C order of the axes before the last. It wraps, as read_place says.
   MPMJAX_INLINE int32_t node(int row, int q, int j = 0) const {
     int32_t sum = index[d - 1][j][q];
     if constexpr (d == 2) sum = wrapping_sum(index[0][row][q], sum);

@@ -303,6 +303,7 @@ void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
     Block<T, d, s> block, derivatives;
     block.find_range(task.stencils, start, count);
     block.evaluate(task.stencils, start, count);
+    std::memcpy(derivatives.offset, block.offset, sizeof block.offset);
     derivatives.evaluate(task.stencils, start, count, ~0u);
     for (int q = 0; q < count; q += kSimdLanes<T>) {
       const ParticleLanes<T> lanes(start + q, last, task.stencils.particles);

@@ -71,7 +71,7 @@ MPMJAX_INLINE Range range_of(const int32_t* least, const int32_t* most, int coun
 }
 
 // Marks the blocks of kChunk nodes that a block of particles reaches: for each index of the first axis, from the least to
-// the most that the axes after it add. Several threads mark at a time.
+// the most that the axes after it add, of all particles where they share the index. Several threads mark at a time.
 template <class T, int d, int s>
 void mark(const Block<T, d, s>& block, int count, int64_t size, bool* reached) {
   const Range beyond = range_of(block.least_beyond, block.most_beyond, count);
@@ -79,8 +79,9 @@ void mark(const Block<T, d, s>& block, int count, int64_t size, bool* reached) {
     const BlockInt terms = load_as<BlockInt>(block.index[0][i]);
     const int some = any(terms ^ terms[0]) ? count : 1;
     for (int q = 0; q < some; ++q) {
-      const int64_t from = std::max<int64_t>(int64_t(terms[q]) + beyond.least, 0);
-      const int64_t to = std::min<int64_t>(int64_t(terms[q]) + beyond.most, size - 1);
+      const Range after = some == 1 ? beyond : Range{block.least_beyond[q], block.most_beyond[q]};
+      const int64_t from = std::max<int64_t>(int64_t(terms[q]) + after.least, 0);
+      const int64_t to = std::min<int64_t>(int64_t(terms[q]) + after.most, size - 1);
       for (int64_t k = from / kChunk; from <= to && k <= to / kChunk; ++k) {
         __atomic_store_n(reached + k, true, __ATOMIC_RELAXED);
       }
@@ -361,7 +362,7 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
   using V = Simd<T>;
   const int64_t particles = task.stencils.particles;
   const T spacing = 1 / task.slope[0], factor = task.factor[0] * task.slope[0];
-  const auto give = [&](const auto&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
+  const auto give = [&](const auto& block, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
     for (int k = 0; k < count; k += kSimdLanes<T>) {
       const ParticleLanes<T> lanes(start + k, start + count, particles);
       by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
@@ -388,7 +389,7 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
         for (int b = 0; b < d; ++b) {
           V moment = V{} + (s == 3 ? T(1) / 4 : T(1) / 3);
           if (s == 2) {
-            const V t = offset_of<s, T>(read(task.stencils.place, b));
+            const V t = load_as<V>(block.offset[b] + k);
             moment = T(0.25) - t * t;
           }
           for (int r = 0; r < d; ++r) {
