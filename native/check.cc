@@ -197,7 +197,10 @@ void check_p2g(const Shape& sh, const Pools& pools) {
         return changed(array)[(b * rows + row) * p + i % p];
       };
       const double mass = changed(task.mass)[i] = 1 + std::abs(task.mass[i]);
-      for (int k = 0; k <= d; ++k) at(made.values.value, d + 1, k) = k < d ? mass * at(task.v, d, k) : mass;
+      for (int k = 0; k <= d; ++k) {
+        const double push = affine && k < d ? task.push[b * d + k] : 0;
+        at(made.values.value, d + 1, k) = k < d ? mass * (at(task.v, d, k) + push) : mass;
+      }
       for (int c = 0; c < d; ++c) {
         const double place = at(task.stencils.place, d, c), t = place - std::floor(place) - 0.5;  // of the linear kernel
         const double moment = sh.s == 2 ? 0.25 - t * t : sh.s == 3 ? 1 / 4.0 : 1 / 3.0;
@@ -212,7 +215,7 @@ void check_p2g(const Shape& sh, const Pools& pools) {
         }
       }
     }
-    if (!affine) task.C = nullptr;
+    if (!affine) task.C = task.push = nullptr;
     if (!pushed || isotropic) task.A = nullptr;
     if (!factored) task.B = nullptr;
     if (kind != 4) task.q = nullptr;

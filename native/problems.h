@@ -167,6 +167,7 @@ struct P2G {
   const T* slope;   // 1/dx
   const T* factor;
   const T *mass, *v;
+  const T* push;        // is added to all v
   const T *C, *A, *B;   // of each particle d rows of d
   const T *q, *r;
   T *whole, *means, *sums;  // as in an average, and so the next
@@ -180,7 +181,7 @@ struct P2G {
     const int d = stencils.basis.d;
     int64_t& p = stencils.particles;
     stencils.arrays(f), f(least, {}), f(slope, {}), f(factor, {}), f(mass, {p}), f(v, {d, p});
-    f(C, {d, d, p}, kOptional), f(A, {d, d, p}, kOptional), f(B, {d, d, p}, kOptional);
+    f(push, {d}, kOptional), f(C, {d, d, p}, kOptional), f(A, {d, d, p}, kOptional), f(B, {d, d, p}, kOptional);
     f(q, {p}, kOptional), f(r, {p}, kOptional);
     f(whole, {size}), f(means, {size, d}), f(sums, {size, columns}), f(reached, {blocks_of(size)}, kOptional);
   }

@@ -362,6 +362,8 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
   using V = Simd<T>;
   const int64_t particles = task.stencils.particles;
   const T spacing = 1 / task.slope[0], factor = task.factor[0] * task.slope[0];
+  T push[d] = {};
+  if (task.push != nullptr) std::copy_n(task.push, d, push);
   const auto give = [&](const auto& block, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
     for (int k = 0; k < count; k += kSimdLanes<T>) {
       const ParticleLanes<T> lanes(start + k, start + count, particles);
@@ -372,7 +374,7 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
         };
         const V m = read(task.mass, 0);
         V given[kLanes] = {};
-        for (int r = 0; r < d; ++r) given[r] = m * read(task.v, r);
+        for (int r = 0; r < d; ++r) given[r] = m * (read(task.v, r) + push[r]);
         given[d] = m;
         to_rows(given, rows[0] + k);
         given[d] = V{};

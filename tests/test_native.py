@@ -263,7 +263,8 @@ def test_resistances_agree(d, dtype):
 @pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
 @pytest.mark.parametrize(("d", "order"), [(3, 2), *thorough((1, 1), (2, 1), (2, 3))])
 def test_transfers_agree(d, order, dtype, choose):
-    """P2G with each of its terms, and G2P with an F and without: one call each, also of a batch, with derivatives."""
+    """P2G with each of its terms and with a push, and G2P with an F and without: one call each, in batches, with
+    derivatives."""
     rng = np.random.default_rng(0)
     numbers = [jnp.asarray(rng.normal(size=shape), dtype) for shape in ((d, 45), *[(d, d, 45)] * 3, (SIDE**d, d))]
     grid, place = mpm.Grid((SIDE,) * d, 0.7), jnp.asarray(rng.uniform(1.5, 2.5, (d, 45)), dtype)
@@ -272,8 +273,8 @@ def test_transfers_agree(d, order, dtype, choose):
     def moved(place, v, A, B, C, nodes):
         stencil = make_stencil(mpm.BSpline(order), mpm.MLSGradient(), grid, window, place.T)
         mass, params = 1 + v[0] ** 2, {"basis": stencil.basis, "size": grid.size}
-        terms = (C, (scale, A, B)), (None, (scale, A, None)), (C, None)
-        terms += (C, (scale, (mass, v[0]), B)), (C, (scale, (None, mass), None))
+        terms = (C, (scale, A, B), v[:, 0]), (None, (scale, A, None), None), (C, None, v[:, 1])
+        terms += (C, (scale, (mass, v[0]), B), None), (C, (scale, (None, mass), None), v[:, 2])
         sums = [_transfer.p2g_sum(stencil, 1e-3 * scale, mass, v, *some, **params) for some in terms]
         return sums, [_transfer.g2p_sum(stencil, nodes, scale, v, F, basis=stencil.basis) for F in (A, None)]
 

@@ -103,14 +103,24 @@ def call_average(
 
 
 def call_p2g(
-    call: Call, stencil: Any, least: Array, mass: Array, v: Array, C: Any, impulse: Any, *, basis: Basis, size: int
+    call: Call,
+    stencil: Any,
+    least: Array,
+    mass: Array,
+    v: Array,
+    C: Any,
+    impulse: Any,
+    push: Any,
+    *,
+    basis: Basis,
+    size: int,
 ) -> list[Array] | None:
     """`p2g_sum`, but for stencils with gradients of their own or without any."""
     if stencil.own_derivatives is not None or stencil.flat is not None or (C is None and impulse is None):
         return None
     factor, A, B = (jnp.zeros_like(least), None, None) if impulse is None else impulse
     A, q, r = (None, *A) if isinstance(A, tuple) else (A, None, None)
-    operands = [stencil.xi, least, stencil.slope, factor, mass, v, C, A, B, q, r]
+    operands = [stencil.xi, least, stencil.slope, factor, mass, v, push, C, A, B, q, r]
     d = v.shape[-2]
     shapes = (size,), (size, d), (size, d + 1)  # the last one holds the sums before they are divided
     results = [jax.ShapeDtypeStruct(shape, v.dtype) for shape in shapes]

@@ -177,6 +177,7 @@ def p2g(
     C: Matrix | None,
     size: int,
     impulse: Impulse | None = None,
+    push: Float[Array, "d"] | None = None,
 ) -> tuple[NodeScalar, NodeVector]:
     """Particles to grid: m_i = Σ_p w_ip m_p and m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)).
 
@@ -191,12 +192,13 @@ def p2g(
         size: number of nodes.
         impulse: factors of I_p [kg m²/s], to add Σ_p I_p g_ip to the momentum in the same sum. g_ip is the
             moving-least-squares gradient if there is a C.
+        push: a velocity that is added to every v_p [m/s], shape (d,), or None for zero.
 
     Returns:
         mass m_i [kg], shape (n,), and velocity v_i [m/s], shape (n, d); both are zero on empty nodes.
     """
     used, least = stencil if C is None else stencil.least_squares, jnp.finfo(mass.dtype).eps * mass.min()
-    return p2g_sum(used, least, mass, v, C, impulse, basis=used.basis, size=size)
+    return p2g_sum(used, least, mass, v, C, impulse, push, basis=used.basis, size=size)
 
 
 @partial(
@@ -208,9 +210,10 @@ def p2g(
     call=call_p2g,
 )
 def p2g_sum(
-    stencil: Stencil, least: Array, mass: Array, v: Array, C: Matrix | None, impulse: Impulse | None, **params: Any
+    stencil: Stencil, least: Array, mass: Array, v: Array, C: Any, impulse: Any, push: Array | None, **params: Any
 ) -> tuple[Array, Array]:
     """`p2g` for a stencil whose gradients are those of both C and impulse."""
+    v = v if push is None else v + push[:, None]
     terms = []
     if impulse is not None:
         factor, A, B = impulse

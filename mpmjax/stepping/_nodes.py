@@ -193,13 +193,13 @@ def particles_to_grid(
         x = particles.x + body_force_at * dt * particles.v if body_force_at else particles.x
         body_force = components(scene.body_force.acceleration(x, t + body_force_at * dt if body_force_at else t))
     # one sum costs half of two, and an explicit step asks for v* alone
-    if joined:
-        v = v + dt * (gravity[:, None] if body_force is None else gravity[:, None] + body_force)
+    if joined and body_force is not None:
+        v = v + dt * body_force
     if stencil.radius is not None and joined:
         around, A = in_section(stencil.radius, A)
         v = v - dt * around / particles.mass
     affine, impulse = C if scene.transfer.affine else None, (jnp.asarray(-dt), A, B) if joined else None
-    mass, v = p2g(stencil, particles.mass, v, affine, size, impulse)
+    mass, v = p2g(stencil, particles.mass, v, affine, size, impulse, dt * gravity if joined else None)
     nodes = Nodes(
         mass=mass,
         v=v,
