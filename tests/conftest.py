@@ -14,8 +14,8 @@ matplotlib.use("Agg")
 
 import jax
 import pytest
+from annotations import checks_of_imports
 from jax._src.interpreters import mlir
-from jaxtyping import install_import_hook
 
 
 def pytest_configure(config: Any) -> None:
@@ -35,7 +35,7 @@ def pytest_configure(config: Any) -> None:
     # MLIR's dialects are loaded once, and not for each program but those lowered within another: a tenth of the time
     new, kept = mlir.make_ir_context, functools.cache(mlir.make_ir_context)
     mlir.make_ir_context = lambda: kept() if mlir.ir.Context.current is None else new()
-    with install_import_hook("mpmjax", "annotations.checked"):
+    with checks_of_imports("mpmjax"):
         import mpmjax.extensions
         import mpmjax.stepping  # noqa: F401
     # tracing makes many objects, few of them in cycles: looking for those took a twelfth of the time

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
+from mpmjax._types import Array, Bool, Deformation, Float, Matrix, PerParticle, Scalar
 from mpmjax.autodiff import custom_derivative
 from mpmjax.checks import between, positive, require_fields
 from mpmjax.linalg import Logarithm, PowerLessOne
@@ -49,7 +49,7 @@ class Hencky(AbstractIsotropic):
             squares = squares + _missing(F) * self.transverse_strain**2
         return self.shear_modulus * squares + self.lame_lambda / 2 * self._dilation(la.trace(strain), F) ** 2
 
-    def in_space(self, F: Matrix) -> tuple["Hencky", Matrix]:
+    def in_space(self, F: Matrix) -> tuple["Hencky", Deformation]:
         """With the stretches exp ε_t."""
         law, whole = Hencky(self.youngs_modulus, self.poisson_ratio), super().in_space(F)[1]
         if self.transverse_strain is not None:
