@@ -116,7 +116,12 @@ def _flux(upper: Array, slopes: Array) -> Array:
     return la.matmul(la.symmetric(upper), slopes.reshape(len(slopes) ** 2, 1, -1)).reshape(slopes.shape)
 
 
-@partial(custom_derivative, kernel="resist", call=lambda call, *args, basis: call(args, basis_attributes(basis)))
+@partial(
+    custom_derivative,
+    kernel="resist",
+    results=lambda xi, upper, u, basis: u,
+    call=lambda call, *args, basis: call(args, basis_attributes(basis)),
+)
 def resist_sum(xi: Array, upper: Array, u: Array, *, basis: Basis) -> Array:
     """`resist` with gradients in spacings, dx² times as much, from the fields of a stencil."""
     groups = (Group(basis.gradient),)

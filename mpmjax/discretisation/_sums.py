@@ -171,7 +171,15 @@ def gather_sum(xi: Array, dxi: Any, nodes: Array, *, basis: Basis, groups: Group
     return _along(groups, [jnp.stack([of[term] for term in group.terms]) for group in plain], dxi)
 
 
-@partial(custom_derivative, kernel="pull", call=call_pull)
+@partial(
+    custom_derivative,
+    kernel="pull",
+    results=lambda xi, nodes, _, groups, gathered, **__: (
+        xi,
+        [jax.ShapeDtypeStruct((len(g.terms), nodes.shape[1], xi.shape[1]), xi.dtype) for g in groups if gathered],
+    ),
+    call=call_pull,
+)
 def pull_sum(
     xi: Array, nodes: Array, rows: Rows, *, basis: Basis, groups: Groups, gathered: bool
 ) -> tuple[Array, list[Array]]:
