@@ -15,8 +15,10 @@
 #include "problems.h"
 #include "xla/ffi/api/ffi.h"
 
-// The sums that all back ends have: calls f(name of the handler, problem).
-#define MPMJAX_SUMS(f) f(gather, Gather) f(scatter, Scatter) f(average, Average) f(pull, Pull) f(resist, Resist)
+// The problems that CPUs and cards solve: calls f(name of the handler, problem).
+#define MPMJAX_PROBLEMS(f)                                                                              \
+  f(gather, Gather) f(scatter, Scatter) f(average, Average) f(pull, Pull) f(resist, Resist) f(p2g, P2G) \
+      f(g2p, G2P) f(eigen, Eigen) f(rotation, Rotation)
 
 namespace ffi = xla::ffi;
 

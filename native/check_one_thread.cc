@@ -17,4 +17,4 @@ ffi::Error run_one_by_one(ffi::Dictionary attributes, ffi::RemainingArgs argumen
 #define MPMJAX_HANDLER(name, Problem)                                                      \
   XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_##name, mpmjax::run_one_by_one<mpmjax::Problem>, \
                                 ffi::Ffi::Bind().Attrs().RemainingArgs().RemainingRets());
-MPMJAX_SUMS(MPMJAX_HANDLER)
+MPMJAX_PROBLEMS(MPMJAX_HANDLER)

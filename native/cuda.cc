@@ -22,8 +22,11 @@
 #define MPMJAX_TEXT(name, file)                                                                           \
   asm(".pushsection .rodata\n" #name ": .incbin \"" MPMJAX_FOLDER "/" file "\"\n.byte 0\n.popsection\n"); \
   extern "C" __attribute__((visibility("hidden"))) const char name[];
-MPMJAX_TEXT(mpmjax_text_problems, "problems.h")
-MPMJAX_TEXT(mpmjax_text_one_thread, "one_thread.h")
+MPMJAX_TEXT(mpmjax_problems, "problems.h")
+MPMJAX_TEXT(mpmjax_numbers, "numbers.h")
+MPMJAX_TEXT(mpmjax_step, "step.h")
+MPMJAX_TEXT(mpmjax_decompositions, "decompositions.h")
+MPMJAX_TEXT(mpmjax_one_thread, "one_thread.h")
 
 namespace mpmjax {
 namespace {
@@ -34,9 +37,12 @@ constexpr int kMajor = 75, kMinor = 76;  // attributes of a device: its compute 
 constexpr int kThreads = 128;            // of a block
 constexpr int64_t kMostMembers = 65535;  // blocks along the second axis of a launch
 
-const char* const kIntegers =
-    "#pragma once\n"
-    "typedef int int32_t; typedef unsigned int uint32_t; typedef long long int64_t;\n";
+// What a kernel includes. NVRTC has no standard library.
+const char* const kNames[] = {"problems.h", "numbers.h", "step.h", "decompositions.h", "one_thread.h", "cstdint",
+                              "initializer_list"};
+const char* const kTexts[] = {
+    mpmjax_problems, mpmjax_numbers, mpmjax_step, mpmjax_decompositions, mpmjax_one_thread,
+    "#pragma once\ntypedef int int32_t; typedef unsigned int uint32_t; typedef long long int64_t;\n", ""};
 
 const char* const kKernel = R"(
 extern "C" __global__ void __launch_bounds__(128)
@@ -134,7 +140,8 @@ std::string compiled(const std::string& kernel, const std::string& card, std::st
   if (compiler == nullptr || !compiler->missing.empty()) return fault = "NVRTC is not loaded", "";
   int major = 0, minor = 0;
   compiler->version(&major, &minor);
-  const std::string all = kernel + mpmjax_text_problems + mpmjax_text_one_thread;
+  std::string all = kernel;
+  for (const char* text : kTexts) all += text;
   const std::string version = std::to_string(major) + "." + std::to_string(minor);
   const std::string path = folder + "/" + hash_of(all + card + version) + ".cubin";
   if (!folder.empty()) {
@@ -142,14 +149,12 @@ std::string compiled(const std::string& kernel, const std::string& card, std::st
     const std::string code((std::istreambuf_iterator<char>(kept)), std::istreambuf_iterator<char>());
     if (!code.empty()) return code;
   }
-  const char* const texts[] = {mpmjax_text_problems, mpmjax_text_one_thread, kIntegers, ""};
-  const char* const names[] = {"problems.h", "one_thread.h", "cstdint", "initializer_list"};
   const std::string target = "--gpu-architecture=" + card;
   const char* const options[] = {target.c_str(), "--std=c++17", "--device-as-default-execution-space"};
   Handle program = nullptr;
   std::string code;
   size_t size = 0;
-  compiler->create(&program, kernel.c_str(), "mpmjax.cu", 4, texts, names);
+  compiler->create(&program, kernel.c_str(), "mpmjax.cu", std::size(kTexts), kTexts, kNames);
   if (compiler->compile(program, 3, options) == 0) {
     compiler->code_size(program, &size), code.resize(size), compiler->code(program, &code[0]);
   } else {
@@ -213,19 +218,23 @@ struct Stream {
   }
 
   template <template <class> class Problem, class T>
-  void launch(const char* name, const Problem<T>& all, int columns, int64_t count, int64_t batch) const {
+  void launch(const char* name, const Problem<T>& all, const Shape& shape, int64_t count, int64_t batch) const {
     if (count == 0 || batch == 0 || !fault.empty()) return;
-    const Basis<T>& basis = all.stencils.basis;
     const std::string problem = name + std::string(sizeof(T) == sizeof(float) ? "<float>" : "<double>");
     const std::string dimensions =
-        std::to_string(basis.d) + ", " + std::to_string(basis.s) + ", " + std::to_string(columns);
-    const Handle function = function_of(context, text_of(problem, dimensions, basis.terms), fault);
+        std::to_string(shape.d) + ", " + std::to_string(shape.s) + ", " + std::to_string(shape.columns);
+    const Handle function = function_of(context, text_of(problem, dimensions, shape.terms), fault);
     if (!fault.empty()) return;
     void* arguments[] = {const_cast<Problem<T>*>(&all), &count, &batch};
     const auto blocks = static_cast<unsigned>((count + kThreads - 1) / kThreads);
     const auto members = static_cast<unsigned>(std::min(batch, kMostMembers));
     const int code = driver().launch(function, blocks, members, 1, kThreads, 1, 1, 0, handle, arguments, nullptr);
     fault = driver().fault(code, name);
+  }
+
+  template <class Problem>
+  void launch(const char* name, const Problem& all, int64_t count, int64_t batch) const {
+    launch(name, all, Shape(), count, batch);
   }
 };
 
@@ -272,7 +281,7 @@ std::string start(const char* nvrtc, const char* cache) {
       mpmjax_##name, mpmjax::run_on_card<mpmjax::Problem>,                                                   \
       ffi::Ffi::Bind().Ctx<ffi::PlatformStream<void*>>().Attrs().RemainingArgs().RemainingRets(),            \
       {ffi::Traits::kCmdBufferCompatible});
-MPMJAX_SUMS(MPMJAX_HANDLER)
+MPMJAX_PROBLEMS(MPMJAX_HANDLER)
 
 extern "C" int mpmjax_interface() { return MPMJAX_INTERFACE; }
 

@@ -1,14 +1,15 @@
-// Decompositions of 3 x 3 matrices, a particle in each lane: the eigenvalues and eigenvectors of symmetric ones, by
+// Decompositions of 3 x 3 matrices, one or one in each lane: the eigenvalues and eigenvectors of symmetric ones, by
 // Jacobi's cyclic method (G. H. Golub, C. F. Van Loan, Matrix Computations, 4th ed., 2013, section 8.5), and the
-// rotation of the polar decomposition, as mpmjax/linalg/_rotation.py writes it (N. J. Higham, V. Noferini, Numer.
+// rotation of the polar decomposition, as mpmjax/linalg/_decompositions.py writes it (N. J. Higham, V. Noferini, Numer.
 // Algorithms 73 (2016) 349, doi 10.1007/s11075-016-0098-7).
 
 #pragma once
 
-#include <limits>
-
-#include "problems.h"
+#if defined(__CUDACC_RTC__)
+#include "numbers.h"
+#else
 #include "vector.h"
+#endif
 
 namespace {
 
@@ -19,18 +20,6 @@ constexpr int kPolishSteps = 2;   // on the rotation itself
 template <class V>
 MPMJAX_INLINE V magnitude(V x) {
   return x < 0 ? -x : x;
-}
-
-template <class V>
-MPMJAX_INLINE V root(V x) {
-#if defined(__clang__)
-  return __builtin_elementwise_sqrt(x);
-#else
-  V y = {};
-#pragma GCC unroll 16
-  for (size_t i = 0; i < sizeof x / sizeof x[0]; ++i) y[i] = std::sqrt(x[i]);
-  return y;
-#endif
 }
 
 template <class V>
@@ -65,33 +54,31 @@ MPMJAX_INLINE void rotate(Matrix<V>& A, Matrix<V>& vectors, V negligible) {
   each<3>([&](auto i) MPMJAX_INLINE_LAMBDA { turn(vectors.at[i][p], vectors.at[i][q]); });
 }
 
-template <class T>
-void eigen(const mpmjax::Eigen<T>& task, int64_t first, int64_t last) {
-  using V = Simd<T>;
-  const V one = V() + 1, negligible = V() + std::numeric_limits<T>::epsilon() / 8;
-  for (int64_t k = first; k < last; k += kSimdLanes<T>) {
-    const ParticleLanes<T> lanes(k, last, task.particles);
-    Matrix<V> A, vectors;
-    V size = {};  // the largest magnitude, of which squares could overflow
-    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA {
-      A.at[i][j] = i <= j ? lanes.load(task.matrices, 3 * i + j) : V();
-      size = magnitude(A.at[i][j]) > size ? magnitude(A.at[i][j]) : size;
-    });
-    size = size == 0 ? one : size;
-    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA {
-      A.at[i][j] /= size;
-      vectors.at[i][j] = i == j ? one : V();
-    });
-    for (int sweep = 0; sweep < kSweeps; ++sweep) {
-      const auto rest = [&](const V& a) MPMJAX_INLINE_LAMBDA { return ~(magnitude(a) <= negligible); };
-      if (!any(rest(A.at[0][1]) | rest(A.at[0][2]) | rest(A.at[1][2]))) break;
-      rotate<0, 1>(A, vectors, negligible);
-      rotate<0, 2>(A, vectors, negligible);
-      rotate<1, 2>(A, vectors, negligible);
-    }
-    each<3>([&](auto i) MPMJAX_INLINE_LAMBDA { lanes.store(task.values, i, A.at[i][i] * size); });
-    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { lanes.store(task.vectors, 3 * i + j, vectors.at[i][j]); });
+// Reads and writes what `lanes` has of the matrices.
+template <class T, class Lanes>
+MPMJAX_INLINE void decompose(const mpmjax::Eigen<T>& task, const Lanes& lanes) {
+  using V = typename Lanes::V;
+  const V one = V() + 1, negligible = V() + T(sizeof(T) == 4 ? 0x1p-26 : 0x1p-55);  // an eighth of a rounding
+  Matrix<V> A, vectors;
+  V size = {};  // the largest magnitude, of which squares could overflow
+  components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA {
+    A.at[i][j] = i <= j ? lanes.load(task.matrices, 3 * i + j) : V();
+    size = magnitude(A.at[i][j]) > size ? magnitude(A.at[i][j]) : size;
+  });
+  size = size == 0 ? one : size;
+  components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA {
+    A.at[i][j] /= size;
+    vectors.at[i][j] = i == j ? one : V();
+  });
+  for (int sweep = 0; sweep < kSweeps; ++sweep) {
+    const auto rest = [&](const V& a) MPMJAX_INLINE_LAMBDA { return (magnitude(a) <= negligible) == 0; };
+    if (!any(rest(A.at[0][1]) | rest(A.at[0][2]) | rest(A.at[1][2]))) break;
+    rotate<0, 1>(A, vectors, negligible);
+    rotate<0, 2>(A, vectors, negligible);
+    rotate<1, 2>(A, vectors, negligible);
   }
+  each<3>([&](auto i) MPMJAX_INLINE_LAMBDA { lanes.store(task.values, i, A.at[i][i] * size); });
+  components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { lanes.store(task.vectors, 3 * i + j, vectors.at[i][j]); });
 }
 
 template <class V>
@@ -124,7 +111,7 @@ template <class V>
 MPMJAX_INLINE V largest_root(const Matrix<V>& F) {
   const V J = determinant(F), one = V() + 1;
   const V squares = total<V>([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { return cofactor(F, i, j) * cofactor(F, i, j); });
-  V result = V() + std::sqrt(static_cast<decltype(J[0] + 0)>(3));
+  V result = root(V() + 3);
   for (int step = 0; step < kNewtonSteps; ++step) {
     const V square = result * result - one, slope = 4 * result * square - 8 * J;
     const V lower = result - (square * square - 8 * J * result - 4 * squares) / (slope == 0 ? one : slope);
@@ -168,11 +155,9 @@ MPMJAX_INLINE Quaternion<V> dominant_quaternion(const Matrix<V>& F, V largest) {
   V adjoint[4][4];
   each<4>([&](auto i) MPMJAX_INLINE_LAMBDA {
     each<4>([&](auto j) MPMJAX_INLINE_LAMBDA {
-      if constexpr (j >= i) {
-        const V minor = signed_minor<i, j>(K);
-        adjoint[i][j] = minor;
-        adjoint[j][i] = minor;
-      }
+      constexpr int row = decltype(i)::value, column = decltype(j)::value;
+      if constexpr (column >= row) adjoint[row][column] = signed_minor<row, column>(K);
+      if constexpr (column < row) adjoint[row][column] = adjoint[column][row];
     });
   });
   Quaternion<V> q = {{adjoint[0][0], adjoint[0][1], adjoint[0][2], adjoint[0][3]}};
@@ -213,26 +198,23 @@ MPMJAX_INLINE void polish(Quaternion<V>& q, const Matrix<V>& F) {
   });
   const V w = q.at[0], x = q.at[1], y = q.at[2], z = q.at[3], a = spin[0], b = spin[1], c = spin[2];
   const V turned[4] = {-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a};
-  const auto near = a * a + b * b + c * c < V() + static_cast<decltype(a[0] + 0)>(0.1);  // else R is hardly known
+  const auto near = 10 * (a * a + b * b + c * c) < 1;  // else R is hardly known
   each<4>([&](auto i) MPMJAX_INLINE_LAMBDA { q.at[i] = near ? q.at[i] + turned[i] / 2 : q.at[i]; });
   normalise(q);
 }
 
-template <class T>
-void rotation(const mpmjax::Rotation<T>& task, int64_t first, int64_t last) {
-  using V = Simd<T>;
-  for (int64_t k = first; k < last; k += kSimdLanes<T>) {
-    const ParticleLanes<T> lanes(k, last, task.particles);
-    Matrix<V> F;
-    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { F.at[i][j] = lanes.load(task.matrices, 3 * i + j); });
-    const V norm = root(total<V>([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { return F.at[i][j] * F.at[i][j]; }));
-    const V size = norm == 0 ? V() + 1 : norm;
-    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { F.at[i][j] /= size; });
-    Quaternion<V> q = dominant_quaternion(F, largest_root(F));
-    for (int step = 0; step < kPolishSteps; ++step) polish(q, F);
-    const Matrix<V> R = rotation_of(q);
-    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { lanes.store(task.rotations, 3 * i + j, R.at[i][j]); });
-  }
+template <class T, class Lanes>
+MPMJAX_INLINE void decompose(const mpmjax::Rotation<T>& task, const Lanes& lanes) {
+  using V = typename Lanes::V;
+  Matrix<V> F;
+  components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { F.at[i][j] = lanes.load(task.matrices, 3 * i + j); });
+  const V norm = root(total<V>([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { return F.at[i][j] * F.at[i][j]; }));
+  const V size = norm == 0 ? V() + 1 : norm;
+  components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { F.at[i][j] /= size; });
+  Quaternion<V> q = dominant_quaternion(F, largest_root(F));
+  for (int step = 0; step < kPolishSteps; ++step) polish(q, F);
+  const Matrix<V> R = rotation_of(q);
+  components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { lanes.store(task.rotations, 3 * i + j, R.at[i][j]); });
 }
 
 }  // namespace

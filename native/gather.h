@@ -8,6 +8,7 @@
 #pragma once
 
 #include "runs.h"
+#include "step.h"
 
 namespace {
 
@@ -255,7 +256,6 @@ void gather_columns(const Gather<T>& task, int64_t first, int64_t last) {
 
 template <class T, int d, int s>
 void g2p(const G2P<T>& task, int64_t first, int64_t last) {
-  const T slope = task.slope[0], dt = task.dt[0];
   for (int64_t start = first; start < last; start += kBlock) {
     const int count = smaller(last - start, kBlock);
     Block<T, d, s> block;
@@ -272,24 +272,10 @@ void g2p(const G2P<T>& task, int64_t first, int64_t last) {
         if (task.F != nullptr) prefetch<true>(task.strained + place);
       }
       by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
-        Simd<T> gradient[d][d];
-        for (int r = 0; r < d; ++r) {
-          lanes.template store<all>(task.value, r, sums.value[r]);
-          lanes.template store<all>(task.moved, r, lanes.template load<all>(task.x, r) + dt * sums.value[r]);
-          for (int b = 0; b < d; ++b) {
-            gradient[r][b] = slope * sums.gradients[b][r];
-            lanes.template store<all>(task.gradient, d * r + b, gradient[r][b]);
-          }
-        }
-        for (int c = 0; c < d && task.F != nullptr; ++c) {
-          Simd<T> column[d];
-          for (int k = 0; k < d; ++k) column[k] = lanes.template load<all>(task.F, d * k + c);
-          for (int r = 0; r < d; ++r) {
-            Simd<T> change = {};
-            for (int k = 0; k < d; ++k) change += gradient[r][k] * column[k];
-            lanes.template store<all>(task.strained, d * r + c, column[r] + dt * change);
-          }
-        }
+        take<d>(
+            task, sums.value, sums.gradients,
+            [&](const T* from, int row) MPMJAX_INLINE_LAMBDA { return lanes.template load<all>(from, row); },
+            [&](T* to, int row, Simd<T> v) MPMJAX_INLINE_LAMBDA { lanes.template store<all>(to, row, v); });
       });
     }
   }

@@ -53,14 +53,10 @@ ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType:
   XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_##name, (mpmjax::run_on_threads<__VA_ARGS__>), \
                                 ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attrs().RemainingArgs().RemainingRets());
 #define MPMJAX_HANDLER(name, Problem) MPMJAX_HANDLER_OF(name, mpmjax::Problem<float>, mpmjax::Problem<double>)
-MPMJAX_SUMS(MPMJAX_HANDLER)
-MPMJAX_HANDLER(p2g, P2G)
-MPMJAX_HANDLER(g2p, G2P)
+MPMJAX_PROBLEMS(MPMJAX_HANDLER)
 MPMJAX_HANDLER(solve, Solve)
 MPMJAX_HANDLER(combine, Combine)
 MPMJAX_HANDLER(product, Product)
-MPMJAX_HANDLER(eigen, Eigen)
-MPMJAX_HANDLER(rotation, Rotation)
 MPMJAX_HANDLER(rearrange, Rearrangement)
 MPMJAX_HANDLER_OF(order, mpmjax::Order, mpmjax::Order)
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_stored, mpmjax::run_stored,

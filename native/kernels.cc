@@ -15,6 +15,11 @@ constexpr Kernels<T> sums_of = {{gather<T, d, s>, pull<T, d, s>, g2p<T, d, s>, s
                                  p2g<T, d, s>, resist<T, d, s>},
                                 find_ranges<T, d, s>};
 
+template <template <class> class Problem, class T>
+void decompose_all(const Problem<T>& task, int64_t first, int64_t last) {
+  for (int64_t k = first; k < last; k += kSimdLanes<T>) decompose(task, ParticleLanes<T>(k, last, task.particles));
+}
+
 template <class T>
 const Kernels<T>* sums(int d, int s) {
   static constexpr Kernels<T> table[][3] = {{sums_of<T, 1, 2>, sums_of<T, 1, 3>, sums_of<T, 1, 4>},
@@ -28,7 +33,8 @@ const Kernels<T>* sums(int d, int s) {
 namespace mpmjax {
 
 template <class Target, class T>
-const KernelSet<T> Compiled<Target, T>::kernels = {sums<T>, ::eigen<T>, ::rotation<T>, ::combine<T>, ::product<T>};
+const KernelSet<T> Compiled<Target, T>::kernels = {sums<T>, decompose_all<Eigen, T>, decompose_all<Rotation, T>,
+                                                    ::combine<T>, ::product<T>};
 
 #if defined(MPMJAX_NUMBER)
 template struct Compiled<MPMJAX_TARGET, MPMJAX_NUMBER>;

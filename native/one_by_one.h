@@ -1,4 +1,4 @@
-// The sums of one_thread.h on a CPU, one thread after the other.
+// The kernels of one_thread.h on a CPU, one thread after the other.
 
 #pragma once
 
@@ -27,14 +27,19 @@ struct OneByOne {
   }
 
   template <class Problem>
-  void launch(const char*, const Problem& all, int columns, int64_t count, int64_t batch) const {
-    with_constant<1, 4>(all.stencils.basis.d, [&](auto d) {
-      with_constant<2, 5>(all.stencils.basis.s, [&](auto s) {
-        with_constant<0, most_columns + 1>(columns > most_columns ? 0 : columns, [&](auto c) {
+  void launch(const char*, const Problem& all, const Shape& shape, int64_t count, int64_t batch) const {
+    with_constant<1, 4>(shape.d, [&](auto d) {
+      with_constant<2, 5>(shape.s, [&](auto s) {
+        with_constant<0, most_columns + 1>(shape.columns > most_columns ? 0 : shape.columns, [&](auto c) {
           for (int64_t i = 0; i < count * batch; ++i) one_thread::run<d, s, c>(member(all, i / count), i % count);
         });
       });
     });
+  }
+
+  template <class Problem>
+  void launch(const char*, const Problem& all, int64_t count, int64_t batch) const {
+    for (int64_t i = 0; i < count * batch; ++i) one_thread::run<0, 0, 0>(member(all, i / count), i % count);
   }
 };
 

@@ -7,13 +7,9 @@
 
 #pragma once
 
-#include "problems.h"
+#include "decompositions.h"
+#include "step.h"
 
-#if defined(__CUDACC_RTC__)
-#define MPMJAX_UNROLL _Pragma("unroll")
-#else
-#define MPMJAX_UNROLL
-#endif
 // Terms of the polynomials, a constant where a kernel is compiled for one basis.
 #if !defined(MPMJAX_TERMS)
 #define MPMJAX_TERMS basis.terms
@@ -88,11 +84,15 @@ struct Particle {
     MPMJAX_UNROLL for (int a = 0; a < d; ++a) {
       const int64_t at = a * from.particles + number;
       const bool slope = differentiated >> a & 1;
-      const T place = from.place[at], t = place - first_of<s>(place) - T(s - 1) / 2;
-      const T factor = slope && from.change != nullptr ? from.change[at] : T(1);
+      const T t = offset(from, a), factor = slope && from.change != nullptr ? from.change[at] : T(1);
       polynomials(from.basis, from.basis.weights, t, slope, factor, weights[a]);
       polynomials(from.basis, from.basis.slopes, t, slope, factor, slopes[a]);
     }
+  }
+
+  T offset(const Stencils<T>& from, int a) const {
+    const T place = from.place[a * from.particles + number];
+    return place - first_of<s>(place) - T(s - 1) / 2;
   }
 
   // Σ_k c_k (t − τ)^k for each node, or the derivative Σ_k k c_k (t − τ)^(k−1), times a factor.
@@ -153,8 +153,9 @@ struct Nodes {
 // What a particle gives: the value and each gradient.
 template <class T, int d, int c>
 struct Given {
-  Row<T, c> at[d + 1];
+  Row<T, c> at[d + 1] = {};
 
+  Given() = default;
   Given(const ParticleValues<T>& values, int64_t p, int64_t particles, int64_t column, int64_t columns) {
     MPMJAX_UNROLL for (int k = 0; k < c; ++k) {
       const int64_t m = column + k;
@@ -313,16 +314,63 @@ void run(const Resist<T>& all, int64_t p) {
   Particle<T, d, s> at(all.stencils, p);
   at.evaluate(all.stencils);
   const auto sums = collect<0>(at, 0, Nodes<T, d, const T>(all.moved, all.size, d, 0));
-  Row<T, d> given[d + 1] = {};
+  Given<T, d, d> given;
   const T* from = all.matrices + p;
   MPMJAX_UNROLL for (int i = 0; i < d * d; ++i) {
     MPMJAX_UNROLL for (int j = i; j < d * d; ++j, from += particles) {
       const T entry = *from;
-      given[1 + i / d].at[i % d] += entry * sums.gradients[j / d].at[j % d];
-      if (j > i) given[1 + j / d].at[j % d] += entry * sums.gradients[i / d].at[i % d];
+      given.at[1 + i / d].at[i % d] += entry * sums.gradients[j / d].at[j % d];
+      if (j > i) given.at[1 + j / d].at[j % d] += entry * sums.gradients[i / d].at[i % d];
     }
   }
-  spread<0>(at, 0, given, Nodes<T, d, T>(all.nodes, all.size, d, 0));
+  spread<0>(at, 0, given.at, Nodes<T, d, T>(all.nodes, all.size, d, 0));
+}
+
+// Arrays (..., p) at one particle.
+template <class T>
+struct Lane {
+  using V = T;
+  int64_t p, particles;
+
+  T load(const T* array, int row) const { return array[row * particles + p]; }
+  void store(T* array, int row, T number) const { array[row * particles + p] = number; }
+};
+
+template <int d, int s, int, class T>
+void run(const P2G<T>& all, int64_t p) {
+  const Lane<T> lane = {p, all.stencils.particles};
+  Particle<T, d, s> at(all.stencils, p);
+  at.evaluate(all.stencils);
+  Given<T, d, d + 1> given;
+  give<d, s, T>(
+      all, [&](int b) { return at.offset(all.stencils, b); },
+      [&](const T* array, int row) { return lane.load(array, row); },
+      [&](int row, const T* numbers) {
+        MPMJAX_UNROLL for (int k = 0; k <= d; ++k) given.at[row].at[k] = numbers[k];
+      });
+  spread<0>(at, 0, given.at, Nodes<T, d + 1, T>(all.sums, all.size, d + 1, 0));
+}
+
+template <int d, int s, int, class T>
+void run(const G2P<T>& all, int64_t p) {
+  const Lane<T> lane = {p, all.stencils.particles};
+  Particle<T, d, s> at(all.stencils, p);
+  at.evaluate(all.stencils);
+  const auto sums = collect<0>(at, 0, Nodes<T, d, const T>(all.nodes, all.size, d, 0));
+  const T* gradients[d];
+  MPMJAX_UNROLL for (int b = 0; b < d; ++b) gradients[b] = sums.gradients[b].at;
+  take<d>(
+      all, sums.value.at, gradients, [&](const T* array, int row) { return lane.load(array, row); },
+      [&](T* array, int row, T number) { lane.store(array, row, number); });
+}
+
+template <int, int, int, class T>
+void run(const Eigen<T>& all, int64_t p) {
+  decompose(all, Lane<T>{p, all.particles});
+}
+template <int, int, int, class T>
+void run(const Rotation<T>& all, int64_t p) {
+  decompose(all, Lane<T>{p, all.particles});
 }
 
 // Of a node, once its sums are whole. Where the last column is not more than the least, all are zero.

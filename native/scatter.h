@@ -9,6 +9,7 @@
 #pragma once
 
 #include "block.h"
+#include "step.h"
 #if defined(__SSE2__)
 #include <emmintrin.h>
 #endif
@@ -361,10 +362,7 @@ template <class T, int d, int s>
 void p2g(const P2G<T>& task, int64_t first, int64_t last) {
   using V = Simd<T>;
   const int64_t particles = task.stencils.particles;
-  const T spacing = 1 / task.slope[0], factor = task.factor[0] * task.slope[0];
-  T push[d] = {};
-  if (task.push != nullptr) std::copy_n(task.push, d, push);
-  const auto give = [&](const auto& block, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
+  const auto give_block = [&](const auto& block, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
     for (int k = 0; k < count; k += kSimdLanes<T>) {
       const ParticleLanes<T> lanes(start + k, start + count, particles);
       by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
@@ -372,42 +370,15 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
           prefetch(array + row * particles + start + k);
           return lanes.template load<all>(array, row);
         };
-        const V m = read(task.mass, 0);
-        V given[kLanes] = {};
-        for (int r = 0; r < d; ++r) given[r] = m * (read(task.v, r) + push[r]);
-        given[d] = m;
-        to_rows(given, rows[0] + k);
-        given[d] = V{};
-        const V q = task.q == nullptr ? V{} : factor * read(task.q, 0);
-        const V even = task.r == nullptr ? V{} : factor * read(task.r, 0);
-        V A[d][d], B[d][d], C[d][d];
-        for (int r = 0; r < d; ++r) {
-          for (int b = 0; b < d; ++b) {
-            C[r][b] = task.C == nullptr ? V{} : m * read(task.C, d * r + b);
-            B[r][b] = task.B == nullptr ? V{} : read(task.B, d * r + b);
-            A[r][b] = task.A == nullptr ? q * B[r][b] : factor * read(task.A, d * r + b);
-          }
-        }
-        for (int b = 0; b < d; ++b) {
-          V moment = V{} + (s == 3 ? T(1) / 4 : T(1) / 3);
-          if (s == 2) {
-            const V t = load_as<V>(block.offset[b] + k);
-            moment = T(0.25) - t * t;
-          }
-          for (int r = 0; r < d; ++r) {
-            given[r] = spacing * moment * C[r][b];
-            if (task.A != nullptr && task.B == nullptr) given[r] += A[r][b];
-            for (int l = 0; l < d && task.B != nullptr; ++l) given[r] += A[r][l] * B[b][l];
-          }
-          given[b] += even;
-          to_rows(given, rows[b + 1] + k);
-        }
+        const auto offset = [&](int b) MPMJAX_INLINE_LAMBDA { return load_as<V>(block.offset[b] + k); };
+        const auto put = [&](int row, const V* given) MPMJAX_INLINE_LAMBDA { to_rows(given, rows[row] + k); };
+        give<d, s, V>(task, offset, read, put);
       });
     }
   };
   average_of<T, d, s>(task, first, last, [&] {
     const NodeSums<T, s, d + 1> nodes(task.sums, d + 1, 0, first, last);
-    add_blocks<T, d, s, true, d + 1>(task.stencils, task.ranges, nodes, give);
+    add_blocks<T, d, s, true, d + 1>(task.stencils, task.ranges, nodes, give_block);
   });
 }
 

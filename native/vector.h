@@ -7,14 +7,12 @@
 #pragma once
 
 #include <algorithm>
-#include <cmath>
-#include <cstdint>
 #include <cstring>
 #include <type_traits>
 #include <utility>
 
-#define MPMJAX_INLINE inline __attribute__((always_inline))
-#define MPMJAX_INLINE_LAMBDA __attribute__((always_inline))
+#include "numbers.h"
+
 #define MPMJAX_NOINLINE __attribute__((noinline))  // once, not in each of its many uses
 
 namespace {
@@ -108,24 +106,16 @@ MPMJAX_INLINE void to_rows(const V* columns, Rows* rows) {
   std::memcpy(rows, fours, sizeof fours);
 }
 
-// Calls f(0), ..., f(count - 1): unrolled with constants, or as a loop where speed matters less than the size of the
-// code.
-template <int count, bool unrolled = true, class F>
-MPMJAX_INLINE void each(const F& f) {
-  if constexpr (unrolled) {
-    static_assert(count <= 4, "as many nodes as the cubic kernel has");
-    f(std::integral_constant<int, 0>());
-    if constexpr (count > 1) f(std::integral_constant<int, 1>());
-    if constexpr (count > 2) f(std::integral_constant<int, 2>());
-    if constexpr (count > 3) f(std::integral_constant<int, 3>());
-  } else {
+template <class V>
+MPMJAX_INLINE V root(V x) {
 #if defined(__clang__)
-#pragma clang loop unroll(disable) vectorize(disable)
+  return __builtin_elementwise_sqrt(x);
 #else
-#pragma GCC unroll 1
+  V y = {};
+#pragma GCC unroll 16
+  for (size_t i = 0; i < sizeof x / sizeof x[0]; ++i) y[i] = std::sqrt(x[i]);
+  return y;
 #endif
-    for (int i = 0; i < count; ++i) f(i);
-  }
 }
 
 // Whether a comparison holds in any lane.
@@ -140,6 +130,7 @@ MPMJAX_INLINE bool any(M where) {
 // Rows of arrays (..., p) for as many particles from the k-th on as there are lanes, or until the last.
 template <class T>
 struct ParticleLanes {
+  using V = Simd<T>;
   int64_t first, stride;
   size_t bytes;
 

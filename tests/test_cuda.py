@@ -25,7 +25,9 @@ from test_native import (
     resisted,
     resisted_in_parts,
     summed,
+    transfers,
 )
+from test_native_matrices import decomposed
 
 import mpmjax as mpm
 from mpmjax.cli._commands import installation
@@ -52,13 +54,13 @@ class OneByOne(AbstractBackend):
 @pytest.fixture(scope="session")
 def kernels(pytestconfig):
     """Kernels for a CPU, compiled once and kept in pytest's cache as long as their sources are the same."""
-    names = "check_one_thread.cc", "one_by_one.h", "launches.h", "one_thread.h", "calls.h", "problems.h"
-    sources = b"".join((NATIVE / name).read_bytes() for name in names) + jax.__version__.encode()
+    source = NATIVE / "check_one_thread.cc"
+    sources = b"".join(path.read_bytes() for path in (source, *sorted(NATIVE.glob("*.h")))) + jax.__version__.encode()
     folder = pytestconfig.cache.mkdir("one_thread")
     path = folder / f"{hashlib.sha256(sources).hexdigest()[:16]}.so"
     if not path.is_file():
         command = ["c++", "-std=c++17", "-shared", "-fPIC", "-Wno-psabi", "-isystem", jax.ffi.include_dir()]
-        subprocess.run([*command, str(NATIVE / names[0]), "-o", str(path)], check=True)
+        subprocess.run([*command, str(source), "-o", str(path)], check=True)
     handle = ctypes.CDLL(str(path))
     for name in _library.CUDA_KERNELS:
         capsule = jax.ffi.pycapsule(getattr(handle, f"mpmjax_{name}"))
@@ -139,6 +141,24 @@ def test_averages_and_resistances_agree(one_by_one, d, dtype):
 
 
 @NEEDS_COMPILER
+@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
+@pytest.mark.parametrize(("d", "order"), [(2, 2), *thorough((1, 1), (2, 1), (3, 2), (3, 3))])
+def test_transfers_agree(one_by_one, d, order, dtype):
+    """Alone and in a batch."""
+    moved, args = transfers(d, order, dtype)
+    agree(*one_by_one(moved, *args), dtype)
+    agree(*one_by_one(jax.vmap(moved), *(jnp.stack([a, a[..., ::-1]]) for a in args)), dtype)
+
+
+@NEEDS_COMPILER
+@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
+def test_decompositions_agree(one_by_one, dtype):
+    """Of random matrices and of zero, in a batch."""
+    F = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, 3, 40)), dtype).at[..., 7].set(0)
+    agree(*one_by_one(jax.vmap(decomposed), F), dtype)
+
+
+@NEEDS_COMPILER
 def test_a_particle_that_is_not_finite_spoils_its_own_nodes_alone(one_by_one):
     """As in XLA: the same entries are finite."""
     xi, given, nodes = problem(2, 3, 3, 20, "float32")
@@ -161,8 +181,9 @@ def test_nvrtc_compiles_the_kernels(card, number, dimensions, tmp_path):
         texts = (text.encode() for text in (NVRTC[0], str(tmp_path), f"{name}<{number}>", dimensions))
         return library.mpmjax_compile(*texts, 3, card.encode()).decode()
 
-    assert [fault(name.capitalize()) for name in _library.CUDA_KERNELS] == [""] * 5
-    assert len(list(tmp_path.glob("*.cubin"))) == 5
+    names = [{"p2g": "P2G", "g2p": "G2P"}.get(name, name.capitalize()) for name in _library.CUDA_KERNELS]
+    assert [fault(name) for name in names] == [""] * len(names)
+    assert len(list(tmp_path.glob("*.cubin"))) == len(names)
     assert "Nothing" in fault("Nothing")
 
 
@@ -193,7 +214,7 @@ print(_backend.Cuda.absence())
 scene, particles = block(2)
 run = jax.jit(lambda q: mpm.rollout(scene, q, steps=1, dt=1e-3).x)
 text = run.trace(mpm.prepare(scene, particles)).lower(lowering_platforms=("cuda",)).as_text()
-print("mpmjax_average" in text or "mpmjax_scatter" in text, "mpmjax_gather" in text)
+print("mpmjax_p2g" in text, "mpmjax_g2p" in text)
 """
 
 

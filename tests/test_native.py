@@ -259,12 +259,8 @@ def test_resistances_agree(d, dtype):
     np.testing.assert_array_equal(together, jnp.stack([run(*rest, one) for one in both]))
 
 
-@NEEDS_LIBRARY
-@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
-@pytest.mark.parametrize(("d", "order"), [(3, 2), *thorough((1, 1), (2, 1), (2, 3))])
-def test_transfers_agree(d, order, dtype, choose):
-    """P2G with each of its terms and with a push, and G2P with an F and without: one call each, in batches, with
-    derivatives."""
+def transfers(d, order, dtype):
+    """P2G with each of its terms and with a push, and G2P with an F and without, as a function, and its arguments."""
     rng = np.random.default_rng(0)
     numbers = [jnp.asarray(rng.normal(size=shape), dtype) for shape in ((d, 45), *[(d, d, 45)] * 3, (SIDE**d, d))]
     grid, place = mpm.Grid((SIDE,) * d, 0.7), jnp.asarray(rng.uniform(1.5, 2.5, (d, 45)), dtype)
@@ -278,7 +274,15 @@ def test_transfers_agree(d, order, dtype, choose):
         sums = [_transfer.p2g_sum(stencil, 1e-3 * scale, mass, v, *some, **params) for some in terms]
         return sums, [_transfer.g2p_sum(stencil, nodes, scale, v, F, basis=stencil.basis) for F in (A, None)]
 
-    args = (place, *numbers)
+    return moved, (place, *numbers)
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
+@pytest.mark.parametrize(("d", "order"), [(3, 2), *thorough((1, 1), (2, 1), (2, 3))])
+def test_transfers_agree(d, order, dtype, choose):
+    """One call each, in batches, with derivatives."""
+    moved, args = transfers(d, order, dtype)
     along = tuple(jnp.cos(3 * a) for a in args)
     agree(*by_each(choose, moved, *args), dtype)
     agree(*by_each(choose, lambda *args: jax.jvp(moved, args, along)[1], *args), dtype, roundings=1000)
