@@ -243,19 +243,16 @@ rest_of_product = custom_derivative(_product, kernel="product", aliases={0: 0}).
 the window, of which a body may fill a small part; natively it is one, in place, that skips inactive blocks."""
 
 
-def _combine(
-    a: Array, b: Array, c: Array, d: Array, scales: Array, weight: Array, active: Array
-) -> tuple[Array, Array, Array]:
-    """Two sums of two vectors with a norm. In JAX these are some four passes over the window, of which a body may fill
-    a small part; natively it is one, in place, that skips inactive blocks."""
-    return a + scales[0] * b, (z := c + scales[1] * d), (weight * z * z).sum()
-
-
 combine_onto = tuple(
-    custom_derivative(_combine, kernel="combine", aliases={onto: 0, 2 + onto: 1}).differentiated_as_written()
+    custom_derivative(
+        lambda a, b, c, d, scales, weight, _: (a + scales[0] * b, z := c + scales[1] * d, (weight * z * z).sum()),
+        kernel="combine",
+        aliases={onto: 0, 2 + onto: 1},
+    ).differentiated_as_written()
     for onto in (0, 1)
 )
-"""`_combine`, its results in the memory of a and c, or of b and d."""
+"""Two sums of two vectors with a norm, in the memory of a and c, or of b and d. In JAX these are some four passes over
+the window, of which a body may fill a small part; natively it is one that skips inactive blocks."""
 
 
 _COUNT = partial(jnp.zeros, (), jnp.int32)

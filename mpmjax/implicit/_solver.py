@@ -172,6 +172,19 @@ class Iterate(NamedTuple):
     done: Any = None
 
 
+def _while_loop(
+    cond_fun: Callable[[Iterate], Array], body_fun: Callable[[Iterate], Iterate], first: Iterate
+) -> Iterate:
+    """`jax.lax.while_loop` with all scalars in one array: on a GPU each that a loop carries is a kernel of its own."""
+    split, dtype = partial(eqx.partition, filter_spec=jax.tree.map(lambda a: a.ndim == 0, first)), first.x.dtype
+    some, tree = jax.tree.flatten(split(first)[0])
+    pack = lambda c: ((parts := split(c))[1], jnp.stack([a.astype(dtype) for a in jax.tree.leaves(parts[0])]))  # noqa: E731
+    cast = lambda numbers: [a.astype(b.dtype) for a, b in zip(numbers, some, strict=True)]  # noqa: E731
+    unpack = lambda carry: eqx.combine(carry[0], jax.tree.unflatten(tree, cast(carry[1])))  # noqa: E731
+    end = jax.lax.while_loop(lambda c: cond_fun(unpack(c)), lambda c: pack(body_fun(unpack(c))), pack(first))
+    return unpack(end)
+
+
 def conjugate_residual(
     space: Space, b: Array, x: Array, rtol: Scalar, max_steps: Scalar, increment_rtol: Scalar | None = None
 ) -> Iterate:
@@ -214,7 +227,7 @@ def conjugate_residual(
         stalled = rr > c.restart_rr / 4
         start = start._replace(stalled=stalled, done=stalled | ~cond_fun(start))
         least = (_REACH * eps) ** 2 * rr
-        end = jax.lax.while_loop(lambda c: cond_fun(c) & (c.rr > least), body_fun, start)
+        end = _while_loop(lambda c: cond_fun(c) & (c.rr > least), body_fun, start)
         moved = end.x - c.x
         return end._replace(correction=jnp.where(end.done, c.correction, jnp.sqrt(dot(moved, moved))))
 
@@ -222,7 +235,7 @@ def conjugate_residual(
     infinite, k = jnp.full_like(b_norm, jnp.inf), jnp.zeros(b_norm.shape, jnp.int32)
     first = Iterate(x, infinite, k, zero, no, no, infinite, no, b_norm, None, no)
     first = first._replace(r=zeros, p=zeros, q=zeros, qq=zero, gamma=infinite, restart_rr=infinite, done=no)
-    end = jax.lax.while_loop(lambda c: ~c.done, restart, first)
+    end = _while_loop(lambda c: ~c.done, restart, first)
     return end._replace(x_norm=jnp.sqrt(dot(end.x, end.x)))
 
 
