@@ -277,5 +277,5 @@ def test_the_script_for_a_card_runs(tmp_path):
     subprocess.run([sys.executable, str(script), "--quick", "--json", str(rows)], check=True)
     told = json.loads(rows.read_text())["rows"]
     assert [row["right"] for row in told if "right" in row] == [True, True]
-    assert len(told) == 8
+    assert len(told) == 9
     assert all(np.isfinite(value) for row in told for key, value in row.items() if key != "what")

@@ -3,7 +3,7 @@
 import os
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -22,8 +22,9 @@ class AbstractBackend(eqx.Module):
     name: ClassVar[str]  # the name in MPMJAX_BACKEND and in reports
     platform: ClassVar[str]  # the platform of JAX, such as cpu
     prefix: ClassVar[str] = "mpmjax_"  # of the names that its kernels have in XLA's registry
-    gains_from_order: ClassVar[bool] = False
-    """Whether sorting particles by cell saves more time in its sums than it takes."""
+    sorts: ClassVar[Literal["cell after cell", "cells in turn"] | None] = None
+    """How particles lie best where sorting them saves more time in its sums than it takes: those of a cell together, or
+    one of each cell and then the next one of each; None where it does not."""
     by_default: ClassVar[bool] = True  # whether it is taken without being asked for
 
     @staticmethod
@@ -77,7 +78,7 @@ class Native(AbstractBackend):
 
     name = "native"
     platform = "cpu"
-    gains_from_order = True
+    sorts = "cell after cell"
 
     @staticmethod
     def absence() -> str:
@@ -103,6 +104,7 @@ class Cuda(AbstractBackend):
 
     name = "cuda"
     platform = "cuda"
+    sorts = "cells in turn"  # threads side by side that add to the same nodes wait for each other
     by_default = False  # until it has run on a card
 
     @staticmethod
