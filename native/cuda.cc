@@ -172,10 +172,20 @@ std::string compiled(const std::string& kernel, const std::string& card, std::st
   return code;
 }
 
-// The text of a kernel: of a problem such as `Gather<float>`, for d, s and columns such as `3, 3, 4`.
+// The bytes of a problem such as `Gather<float>`.
+size_t size_of(const std::string& problem) {
+#define MPMJAX_SIZE(name, Problem)                                    \
+  if (problem == #Problem "<float>") return sizeof(Problem<float>);   \
+  if (problem == #Problem "<double>") return sizeof(Problem<double>);
+  MPMJAX_PROBLEMS(MPMJAX_SIZE)
+  return 0;
+}
+
+// The text of a kernel of a problem, for d, s and columns such as `3, 3, 4`. Both compilers must lay it out alike.
 std::string text_of(const std::string& problem, const std::string& dimensions, int terms) {
   return "#define MPMJAX_TERMS " + std::to_string(terms) + "\n#include \"one_thread.h\"\nusing Problem = mpmjax::" +
-         problem + ";\n#define RUN mpmjax::one_thread::run<" + dimensions + ">" + kKernel;
+         problem + ";\nstatic_assert(sizeof(Problem) == " + std::to_string(size_of(problem)) +
+         ");\n#define RUN mpmjax::one_thread::run<" + dimensions + ">" + kKernel;
 }
 
 // A kernel in a context, which is current: compiled and loaded once.
