@@ -8,7 +8,8 @@ Checks come first: states and gradients by the initial velocity after some steps
 integrators, transfers, kernels and dimensions, in both precisions, against the same on the CPU by XLA. What differs by
 more than a tolerance is named at the end, and the exit status is 1. Then times, by the device's own back end and by XLA
 alone in turns: explicit steps of the blocks of `throughput.py`, an iteration of the solve, shuffled particles, the
-gradient of a hundred steps, and a batch of 1024 members. Medians; memory is that of the compiled program.
+gradient of a hundred steps, and a batch of 1024 members. Medians; memory is that of the compiled program. The default
+tests come last.
 """
 
 import argparse
@@ -204,6 +205,17 @@ def programs(quick: bool) -> Iterator[Row]:
             yield taken(f"{name} of {length} steps, {what} of {len(of.x)}", codes, 2 if quick else 5)
 
 
+def tests(quick: bool) -> Iterator[Row]:
+    """The default tests, on the device."""
+    if quick:
+        return
+    command = [sys.executable, "-m", "pytest", "-q", "-n", str(min(12, os.cpu_count() or 1))]
+    environment = os.environ | {"MPMJAX_BACKEND": kinds()[0]}
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], env=environment, capture_output=True, text=True)
+    lines = [line for line in done.stdout.splitlines() if line.startswith("FAILED") or " in " in line]
+    yield {"what": "\n".join(lines[-20:]), "right": done.returncode == 0}
+
+
 def environment() -> Row:
     """Device, versions and back end."""
     device = jax.devices()[0]
@@ -225,7 +237,7 @@ def shown(row: Row) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small scenes")
-    parser.add_argument("--only", choices=("checks", "steps", "orders", "programs"), help="one part alone")
+    parser.add_argument("--only", choices=("checks", "steps", "orders", "programs", "tests"), help="one part alone")
     parser.add_argument("--json", type=Path, help="a file for the rows")
     parser.add_argument("--reference", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -236,7 +248,7 @@ def main() -> None:
     begun, told = time.perf_counter(), environment()
     print(", ".join(f"{key} {value}" for key, value in told.items()), flush=True)
     rows = []
-    for part in (checks, steps, orders, programs):
+    for part in (checks, steps, orders, programs, tests):
         if options.only not in (None, part.__name__):
             continue
         for row in part(options.quick):

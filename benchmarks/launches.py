@@ -4,6 +4,7 @@ memory.
     python -m pip install "jax[cuda12]"
     python benchmarks/launches.py            # by the CUDA kernels and by XLA alone
     python benchmarks/launches.py --quick    # small scenes
+    python benchmarks/launches.py --cases    # gradients of all that gpu.py checks, in both precisions, by the kernels
 
 Loops are counted in the order in which they end, those within others first: a step, or an iteration of a solve and its
 restarts, or a step and its way back. A turn is the kernels that XLA makes of its fusions and copies, the condition, and
@@ -23,6 +24,7 @@ os.environ["JAX_PLATFORMS"] = "cpu"  # the plugin for cards is loaded, and looks
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from gpu import TOLERANCES, cases
 from jax.experimental import topologies
 from jax.sharding import SingleDeviceSharding
 from laws import LAWS
@@ -30,8 +32,6 @@ from throughput import GRAVITY, LARGE, QUICK, SCENES, Block, block, summed_by
 
 import mpmjax as mpm
 from mpmjax.native import BACKENDS, _library
-
-jax.config.update("jax_enable_x64", False)
 
 H200 = """
 gpu_device_info {
@@ -74,47 +74,66 @@ def loops(program: str) -> list[int]:
     return turns
 
 
-def programs(quick: bool) -> Iterator[tuple[str, Block, Any, Callable[..., Any]]]:
-    """Name, block, law and function of scene, step and state of each."""
+Program = tuple[str, Block, Any, dict[str, Any], Callable[..., Any]]
+"""Name, block, law, other choices of the scene, and a function of scene, step and state."""
 
-    def steps(method: Any = mpm.Explicit(), count: int = 50) -> Callable[..., Any]:
-        return lambda scene, dt, state: mpm.rollout(scene, state, steps=count, dt=dt, method=method)
 
-    def slope(scene: Any, dt: Any, state: Any) -> Any:
-        def height(v: jax.Array) -> jax.Array:
-            return steps()(scene, dt, eqx.tree_at(lambda q: q.v, state, v)).x[:, -1].mean()
+def steps(method: Any = mpm.Explicit(), count: int = 50) -> Callable[..., Any]:
+    return lambda scene, dt, state: mpm.rollout(scene, state, steps=count, dt=dt, method=method)
 
-        return jax.value_and_grad(height)(state.v)
 
+def slope(run: Callable[..., Any]) -> Callable[..., Any]:
+    """The gradient of a height at the end by the velocities at the start."""
+
+    def height(v: jax.Array, scene: Any, dt: Any, state: Any) -> jax.Array:
+        end = run(scene, dt, eqx.tree_at(lambda q: q.v, state, v))
+        return end.x[:, -1].mean() + (end.F**2).mean()
+
+    return lambda scene, dt, state: jax.value_and_grad(height)(state.v, scene, dt, state)
+
+
+def programs(quick: bool) -> Iterator[Program]:
     every = {name: block(*numbers, "float32") for name, numbers in (QUICK if quick else SCENES | LARGE).items()}
+    elastic = LAWS["neo-Hookean"]
     for name, b in every.items():
-        yield f"explicit steps, {name}", b, LAWS["neo-Hookean"], steps()
+        yield f"explicit steps, {name}", b, elastic, {}, steps()
     name, b = next(iter(every.items()))
     for law in LAWS:
-        yield f"{law}, {name}", b, LAWS[law], steps()
-    yield f"a semi-implicit step, {name}", b, LAWS["neo-Hookean"], steps(mpm.SemiImplicit(), 1)
+        yield f"{law}, {name}", b, LAWS[law], {}, steps()
+    yield f"a semi-implicit step, {name}", b, elastic, {}, steps(mpm.SemiImplicit(), 1)
     for name, b in every.items():
         if b.x.shape[1] == 2:
-            yield f"gradient of steps, {name}", b, LAWS["neo-Hookean"], slope
+            yield f"gradient of steps, {name}", b, elastic, {}, slope(steps())
+
+
+def checked() -> Iterator[Program]:
+    for name, d, law, choices, method, factor in cases():
+        for dtype in TOLERANCES:
+            b = block(d, (12, 36, 216)[d - 1], 16, 2**d, dtype)
+            yield f"{name}, {dtype}", b._replace(dt=factor * b.dt), law, choices, slope(steps(method, 5))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small scenes")
+    parser.add_argument("--cases", action="store_true", help="what gpu.py checks")
     options = parser.parse_args()
+    jax.config.update("jax_enable_x64", options.cases)
     card = topologies.get_topology_desc("h200", platform="cuda", topology="1x1x1", target_config=H200)
     place = SingleDeviceSharding(card.devices[0])
     can_use_cuda()
-    for name, b, law, function in programs(options.quick):
-        d, one = b.x.shape[1], jnp.ones(len(b.x), "float32")
-        x, v = jnp.asarray(b.x, "float32"), jnp.asarray(b.v, "float32")
-        scene = mpm.Scene(mpm.Grid((b.nodes,) * d, b.spacing), law, gravity=(*[0.0] * (d - 1), -GRAVITY))
-        given = scene, jnp.asarray(b.dt), mpm.prepare(scene, mpm.Particles(x, v, b.mass * one, b.volume * one))
+    for name, b, law, choices, function in checked() if options.cases else programs(options.quick):
+        d, one = b.x.shape[1], jnp.ones(len(b.x), b.dtype)
+        x, v = jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype)
+        grid, gravity = mpm.Grid((b.nodes,) * d, b.spacing), (*[0.0] * (d - 1), -GRAVITY)
+        scene = mpm.Scene(grid, law, gravity=gravity, **choices)
+        state = mpm.prepare(scene, mpm.Particles(x, v, b.mass * one, b.volume * one))
+        given = scene, jnp.asarray(b.dt, b.dtype), state
         shapes = jax.tree.map(
             lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=place) if eqx.is_array(a) else a, given
         )
         told = []
-        for kind in ("cuda", "xla"):
+        for kind in ("cuda",) if options.cases else ("cuda", "xla"):
             jax.clear_caches()
             with summed_by(kind):
                 program = jax.jit(function).trace(*shapes).lower(lowering_platforms=("cuda",)).compile()
