@@ -7,9 +7,8 @@
 Checks come first: states and gradients by the initial velocity after some steps of a small block, of all laws and
 integrators, transfers, kernels and dimensions, in both precisions, against the same on the CPU by XLA. What differs by
 more than a tolerance is named at the end, and the exit status is 1. Then times, by the device's own back end and by XLA
-alone in turns: explicit steps of the blocks of `throughput.py`, an iteration of the solve, shuffled particles, the
-gradient of a hundred steps, and a batch of 1024 members. Medians; memory is that of the compiled program. The default
-tests come last.
+alone in turns: explicit steps of the blocks of `throughput.py`, an iteration of the solve, the gradient of a hundred
+steps, and a batch of 1024 members. Medians; memory is that of the compiled program. The default tests come last.
 """
 
 import argparse
@@ -161,24 +160,6 @@ def steps(quick: bool) -> Iterator[Row]:
     yield {"what": f"iteration of a solve {name}, float32"} | per
 
 
-def orders(quick: bool) -> Iterator[Row]:
-    """Shuffled particles of a fluid, which are sorted in the first of the steps, or left in the order given."""
-    name, numbers = ("C 20k", (2, 20_000, 128, 4)) if quick else ("A 1M", LARGE["A 1M"])
-    b, count = block(*numbers, "float32"), 10 if quick else 50
-    shuffle, one = np.random.default_rng(0).permutation(len(b.x)), jnp.ones(len(b.x), "float32")
-    x, v = jnp.asarray(b.x[shuffle], "float32"), jnp.asarray(b.v[shuffle], "float32")
-    scene = mpm.Scene(mpm.Grid((b.nodes,) * b.x.shape[1], b.spacing), mpm.Fluid(E_MODULUS))
-    start, codes = mpm.prepare(scene, mpm.Particles(x, v, b.mass * one, b.volume * one)), {}
-    for order in ("sorted", "given"):
-        os.environ |= {"MPMJAX_ORDER": order} if order == "given" else {}
-        with summed_by(kinds()[0]):
-            run = jax.jit(lambda q, dt: mpm.rollout(scene, q, steps=count, dt=dt)).lower(start, b.dt).compile()
-        codes[order] = lambda run=run: jax.block_until_ready(run(start, b.dt))
-        jax.clear_caches()
-    del os.environ["MPMJAX_ORDER"]
-    yield taken(f"step of a shuffled fluid {name}, float32", codes, 2 if quick else 5, count)
-
-
 def programs(quick: bool) -> Iterator[Row]:
     """A gradient beside its run, and a batch."""
     b = block(2, 400 if quick else 10_000, 128, 4, "float32")
@@ -210,7 +191,8 @@ def tests(quick: bool) -> Iterator[Row]:
     if quick:
         return
     command = [sys.executable, "-m", "pytest", "-q", "-n", str(min(12, os.cpu_count() or 1))]
-    environment = os.environ | {"MPMJAX_BACKEND": kinds()[0]}
+    # each worker would else take most of the card's memory, of which this process has a share already
+    environment = os.environ | {"MPMJAX_BACKEND": kinds()[0], "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     done = subprocess.run(command, cwd=Path(__file__).parents[1], env=environment, capture_output=True, text=True)
     lines = [line for line in done.stdout.splitlines() if line.startswith("FAILED") or " in " in line]
     yield {"what": "\n".join(lines[-20:]), "right": done.returncode == 0}
@@ -237,7 +219,7 @@ def shown(row: Row) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small scenes")
-    parser.add_argument("--only", choices=("checks", "steps", "orders", "programs", "tests"), help="one part alone")
+    parser.add_argument("--only", choices=("checks", "steps", "programs", "tests"), help="one part alone")
     parser.add_argument("--json", type=Path, help="a file for the rows")
     parser.add_argument("--reference", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -248,7 +230,7 @@ def main() -> None:
     begun, told = time.perf_counter(), environment()
     print(", ".join(f"{key} {value}" for key, value in told.items()), flush=True)
     rows = []
-    for part in (checks, steps, orders, programs, tests):
+    for part in (checks, steps, programs, tests):
         if options.only not in (None, part.__name__):
             continue
         for row in part(options.quick):

@@ -16,7 +16,7 @@ constexpr Kernels<T> sums_of = {{gather<T, d, s>, pull<T, d, s>, g2p<T, d, s>, s
                                 find_ranges<T, d, s>};
 
 template <template <class> class Problem, class T>
-void decompose_all(const Problem<T>& task, int64_t first, int64_t last) {
+void decompose_lanes(const Problem<T>& task, int64_t first, int64_t last) {
   for (int64_t k = first; k < last; k += kSimdLanes<T>) decompose(task, ParticleLanes<T>(k, last, task.particles));
 }
 
@@ -33,7 +33,7 @@ const Kernels<T>* sums(int d, int s) {
 namespace mpmjax {
 
 template <class Target, class T>
-const KernelSet<T> Compiled<Target, T>::kernels = {sums<T>, decompose_all<Eigen, T>, decompose_all<Rotation, T>,
+const KernelSet<T> Compiled<Target, T>::kernels = {sums<T>, decompose_lanes<Eigen, T>, decompose_lanes<Rotation, T>,
                                                     ::combine<T>, ::product<T>};
 
 #if defined(MPMJAX_NUMBER)

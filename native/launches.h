@@ -2,7 +2,7 @@
 // after the other on a CPU.
 //
 // `on.clear(numbers, count)` sets to zero, `on.launch(name, all, shape, count, batch)` calls one_thread::run for each of
-// so many particles or nodes of each member of a problem of this name; there is no shape where it takes no sum.
+// so many particles or nodes of each member of a problem of this name, which has a shape where it takes sums.
 
 #pragma once
 

@@ -1,5 +1,5 @@
-// The sums as a GPU does them: what one thread does for a particle, or for a node. Plain C++ that NVRTC compiles for a
-// card, and g++ for the tests, which run one thread after the other.
+// Sums, transfers and decompositions as a GPU does them: what one thread does for a particle, or for a node. Plain C++
+// that NVRTC compiles for a card, and g++ for the tests, which run one thread after the other.
 //
 // Terms are products of one polynomial along each axis. So a scatter takes what a particle gives one axis further in, to
 // one node along it; a gather and a pull take the sums over the axes after an axis one step further out. All loops over

@@ -175,7 +175,9 @@ class Iterate(NamedTuple):
 def _while_loop(
     cond_fun: Callable[[Iterate], Array], body_fun: Callable[[Iterate], Iterate], first: Iterate
 ) -> Iterate:
-    """`jax.lax.while_loop` with all scalars in one array: on a GPU each that a loop carries is a kernel of its own."""
+    """`jax.lax.while_loop` with all scalars in one array: on a GPU each that a loop carries is a kernel of its own.
+
+    In single precision it counts to 2²⁴."""
     split, dtype = partial(eqx.partition, filter_spec=jax.tree.map(lambda a: a.ndim == 0, first)), first.x.dtype
     some, tree = jax.tree.flatten(split(first)[0])
     pack = lambda c: ((parts := split(c))[1], jnp.stack([a.astype(dtype) for a in jax.tree.leaves(parts[0])]))  # noqa: E731

@@ -3,7 +3,7 @@
 import os
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -22,9 +22,8 @@ class AbstractBackend(eqx.Module):
     name: ClassVar[str]  # the name in MPMJAX_BACKEND and in reports
     platform: ClassVar[str]  # the platform of JAX, such as cpu
     prefix: ClassVar[str] = "mpmjax_"  # of the names that its kernels have in XLA's registry
-    sorts: ClassVar[Literal["cell after cell", "cells in turn"] | None] = None
-    """How particles lie best where sorting them saves more time in its sums than it takes: those of a cell together, or
-    one of each cell and then the next one of each; None where it does not."""
+    gains_from_order: ClassVar[bool] = False
+    """Whether sorting particles by cell saves more time in its sums than it takes."""
     by_default: ClassVar[bool] = True  # whether it is taken without being asked for
 
     @staticmethod
@@ -78,7 +77,7 @@ class Native(AbstractBackend):
 
     name = "native"
     platform = "cpu"
-    sorts = "cell after cell"
+    gains_from_order = True
 
     @staticmethod
     def absence() -> str:
@@ -100,11 +99,11 @@ class Native(AbstractBackend):
 
 
 class Cuda(AbstractBackend):
-    """Sums in CUDA for NVIDIA's cards, compiled for each card by the NVRTC that JAX brings: of what `Native` sums."""
+    """Kernels in CUDA for NVIDIA's cards, compiled for each card by the NVRTC that JAX brings: the sums, transfers and
+    decompositions of `Native`."""
 
     name = "cuda"
     platform = "cuda"
-    sorts = "cells in turn"  # threads side by side that add to the same nodes wait for each other
     by_default = False  # until it has run on a card
 
     @staticmethod

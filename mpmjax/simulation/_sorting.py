@@ -73,7 +73,7 @@ def memory_order(scene: Scene, particles: Particles, steps: int) -> MemoryOrder 
     countable = LEAST <= particles.count <= 2 ** (jnp.finfo(particles.x.dtype).nmant + 1)
     if asked or not mixes or not countable or scene.body_force is not None or steps < FEWEST:
         return None
-    if backend().sorts is None:
+    if not backend().gains_from_order:
         return None
 
     parameters = []
@@ -108,7 +108,7 @@ def resorted(
             part = cells[group.rows]
             mixed = (jnp.abs(part[1:] - part[:-1]) > 1).mean() > MIXED
             by_number = jnp.arange(part.size, dtype=part.dtype)
-            numbers.append(group.rows.start + jnp.where(mixed, sorted_by_cell(part), by_number))
+            numbers.append(group.rows.start + jnp.where(mixed, by_cell(part), by_number))
         number = jnp.concatenate(numbers)
         new = _places(number)
         return place[number], tuple(new[_whole(rows)].astype(rows.dtype) for rows in _attached(scene))
@@ -157,17 +157,6 @@ def cells_of(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVe
     basis = basis_of(kernel, grid)
     xi, _ = locate(basis, window, components(x) / grid.spacing)
     return basis.index_terms(xi)[:, 0].sum(axis=0, dtype=jnp.int32)
-
-
-def sorted_by_cell(cells: Int[Array, "p"]) -> Order:
-    """The numbers of the particles in the order in which the back end's sums are fastest, shape (p,)."""
-    order = by_cell(cells)
-    if backend().sorts != "cells in turn":
-        return order
-    place, cells = jnp.arange(order.size, dtype=order.dtype), cells[order]
-    begins = jnp.append(True, cells[1:] != cells[:-1])
-    turn = place - jax.lax.cummax(jnp.where(begins, place, 0))  # the number of a particle in its cell
-    return order[by_cell(turn)]
 
 
 @partial(custom_derivative, kernel="order")
