@@ -272,7 +272,7 @@ void g2p(const G2P<T>& task, int64_t first, int64_t last) {
         if (task.F != nullptr) prefetch<true>(task.strained + place);
       }
       by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
-        take<d>(
+        move<d>(
             task, sums.value, sums.gradients,
             [&](const T* from, int row) MPMJAX_INLINE_LAMBDA { return lanes.template load<all>(from, row); },
             [&](T* to, int row, Simd<T> v) MPMJAX_INLINE_LAMBDA { lanes.template store<all>(to, row, v); });

@@ -342,7 +342,7 @@ void run(const P2G<T>& all, int64_t p) {
   Particle<T, d, s> at(all.stencils, p);
   at.evaluate(all.stencils);
   Given<T, d, d + 1> given;
-  give<d, s, T>(
+  put_rows<d, s, T>(
       all, [&](int b) { return at.offset(all.stencils, b); },
       [&](const T* array, int row) { return lane.load(array, row); },
       [&](int row, const T* numbers) {
@@ -359,7 +359,7 @@ void run(const G2P<T>& all, int64_t p) {
   const auto sums = collect<0>(at, 0, Nodes<T, d, const T>(all.nodes, all.size, d, 0));
   const T* gradients[d];
   MPMJAX_UNROLL for (int b = 0; b < d; ++b) gradients[b] = sums.gradients[b].at;
-  take<d>(
+  move<d>(
       all, sums.value.at, gradients, [&](const T* array, int row) { return lane.load(array, row); },
       [&](T* array, int row, T number) { lane.store(array, row, number); });
 }

@@ -362,7 +362,7 @@ template <class T, int d, int s>
 void p2g(const P2G<T>& task, int64_t first, int64_t last) {
   using V = Simd<T>;
   const int64_t particles = task.stencils.particles;
-  const auto give_block = [&](const auto& block, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
+  const auto give = [&](const auto& block, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
     for (int k = 0; k < count; k += kSimdLanes<T>) {
       const ParticleLanes<T> lanes(start + k, start + count, particles);
       by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
@@ -372,13 +372,13 @@ void p2g(const P2G<T>& task, int64_t first, int64_t last) {
         };
         const auto offset = [&](int b) MPMJAX_INLINE_LAMBDA { return load_as<V>(block.offset[b] + k); };
         const auto put = [&](int row, const V* given) MPMJAX_INLINE_LAMBDA { to_rows(given, rows[row] + k); };
-        give<d, s, V>(task, offset, read, put);
+        put_rows<d, s, V>(task, offset, read, put);
       });
     }
   };
   average_of<T, d, s>(task, first, last, [&] {
     const NodeSums<T, s, d + 1> nodes(task.sums, d + 1, 0, first, last);
-    add_blocks<T, d, s, true, d + 1>(task.stencils, task.ranges, nodes, give_block);
+    add_blocks<T, d, s, true, d + 1>(task.stencils, task.ranges, nodes, give);
   });
 }
 

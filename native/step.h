@@ -9,7 +9,7 @@ namespace {
 // Calls put(row, numbers) for the value, row 0, and then the gradient along each axis: d numbers, and the mass or zero.
 // `offset(b)` is that of the particle along an axis.
 template <int d, int s, class V, class T, class Offset, class Read, class Put>
-MPMJAX_INLINE void give(const mpmjax::P2G<T>& task, const Offset& offset, const Read& read, const Put& put) {
+MPMJAX_INLINE void put_rows(const mpmjax::P2G<T>& task, const Offset& offset, const Read& read, const Put& put) {
   const T spacing = 1 / task.slope[0], factor = task.factor[0] * task.slope[0];
   const V m = read(task.mass, 0);
   V given[mpmjax::kMostAxes + 1] = {};
@@ -20,7 +20,7 @@ MPMJAX_INLINE void give(const mpmjax::P2G<T>& task, const Offset& offset, const 
   put(0, given);
   given[d] = V{};
   const V q = task.q == nullptr ? V{} : factor * read(task.q, 0);
-  const V even = task.r == nullptr ? V{} : factor * read(task.r, 0);
+  const V isotropic = task.r == nullptr ? V{} : factor * read(task.r, 0);
   V A[d][d], B[d][d], C[d][d];
   MPMJAX_UNROLL for (int r = 0; r < d; ++r) {
     MPMJAX_UNROLL for (int b = 0; b < d; ++b) {
@@ -39,7 +39,7 @@ MPMJAX_INLINE void give(const mpmjax::P2G<T>& task, const Offset& offset, const 
         if (task.B != nullptr) given[r] += A[r][l] * B[b][l];
       }
     }
-    given[b] += even;
+    given[b] += isotropic;
     put(b + 1, given);
   }
 }
@@ -47,7 +47,7 @@ MPMJAX_INLINE void give(const mpmjax::P2G<T>& task, const Offset& offset, const 
 // Moves particles by the velocity and its gradients in spacings, of which `gradients[b][r]` is that of component r along
 // axis b. `write(array, row, numbers)` may write where it is read.
 template <int d, class V, class T, class Gradients, class Read, class Write>
-MPMJAX_INLINE void take(const mpmjax::G2P<T>& task, const V* value, const Gradients& gradients, const Read& read,
+MPMJAX_INLINE void move(const mpmjax::G2P<T>& task, const V* value, const Gradients& gradients, const Read& read,
                         const Write& write) {
   const T slope = task.slope[0], dt = task.dt[0];
   V gradient[d][d];
