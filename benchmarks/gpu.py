@@ -32,7 +32,7 @@ import mpmjax as mpm
 
 sys.path.append(str(Path(__file__).parent))
 from laws import LAWS
-from throughput import E_MODULUS, ITERATIONS, LARGE, NU, SCENES, Ours, block, iterations, medians, summed_by
+from throughput import E_MODULUS, ITERATIONS, LARGE, NU, SCENES, Ours, block, iterations, medians, prepared, summed_by
 
 jax.config.update("jax_enable_x64", True)
 
@@ -73,18 +73,16 @@ def cases() -> Iterator[tuple[str, int, Any, dict[str, Any], Any, float]]:
 def outcome(d: int, law: Any, choices: dict, method: Any, factor: float, dtype: str) -> Callable[[], tuple]:
     """State and gradient of a small block after some steps."""
     b = block(d, (12, 36, 216)[d - 1], 16, 2**d, dtype)
-    scene = mpm.Scene(mpm.Grid((b.nodes,) * d, b.spacing), law, gravity=(*[0.0] * (d - 1), -9.81), **choices)
 
     def run() -> tuple:
-        x, v, one = jnp.asarray(b.x, dtype), jnp.asarray(b.v, dtype), jnp.ones(len(b.x), dtype)
-        start = mpm.prepare(scene, mpm.Particles(x, v, b.mass * one, b.volume * one))
+        scene, start = prepared(b, law, **choices)
 
         def height(v: jax.Array) -> tuple[jax.Array, tuple]:
             begun = eqx.tree_at(lambda q: q.v, start, v)
             end = mpm.rollout(scene, begun, steps=STEPS, dt=factor * b.dt, method=method)
             return (end.x[:, -1] ** 2).sum() + (end.F**2).sum(), (end.x, end.v, end.F)
 
-        (_, state), slope = jax.jit(jax.value_and_grad(height, has_aux=True))(v)
+        (_, state), slope = jax.jit(jax.value_and_grad(height, has_aux=True))(start.v)
         return *(np.asarray(a) for a in state), np.asarray(slope)
 
     return run
@@ -165,15 +163,14 @@ def programs(quick: bool) -> Iterator[Row]:
     b = block(2, 400 if quick else 10_000, 128, 4, "float32")
     count, members, small = (3, 4, 100) if quick else (100, 1024, 2500)
     for what, of, batch in (("one run", b, None), (f"{members} runs", block(2, small, 64, 4, "float32"), members)):
-        scene = mpm.Scene(mpm.Grid((of.nodes,) * 2, of.spacing), mpm.NeoHookean(E_MODULUS, NU))
-        x, v, one = jnp.asarray(of.x, "float32"), jnp.asarray(of.v, "float32"), jnp.ones(len(of.x), "float32")
-        start = mpm.prepare(scene, mpm.Particles(x, v, of.mass * one, of.volume * one))
+        scene, start = prepared(of, gravity=(0.0, 0.0))
         length = count if batch is None else max(count // 2, 1)
 
         def height(v: jax.Array, scene=scene, start=start, of=of, length=length) -> jax.Array:
             end = mpm.rollout(scene, eqx.tree_at(lambda q: q.v, start, v), steps=length, dt=of.dt)
             return end.x[:, -1].mean()
 
+        v = start.v
         given = v if batch is None else v * jnp.linspace(0.5, 1, batch, dtype="float32")[:, None, None]
         for name, function in (("run", height), ("value and gradient", jax.value_and_grad(height))):
             codes = {}

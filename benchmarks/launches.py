@@ -28,7 +28,7 @@ from gpu import TOLERANCES, cases
 from jax.experimental import topologies
 from jax.sharding import SingleDeviceSharding
 from laws import LAWS
-from throughput import GRAVITY, LARGE, QUICK, SCENES, Block, block, summed_by
+from throughput import LARGE, QUICK, SCENES, Block, block, prepared, summed_by
 
 import mpmjax as mpm
 from mpmjax.native import BACKENDS, _library
@@ -123,11 +123,7 @@ def main() -> None:
     place = SingleDeviceSharding(card.devices[0])
     can_use_cuda()
     for name, b, law, choices, function in checked() if options.cases else programs(options.quick):
-        d, one = b.x.shape[1], jnp.ones(len(b.x), b.dtype)
-        x, v = jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype)
-        grid, gravity = mpm.Grid((b.nodes,) * d, b.spacing), (*[0.0] * (d - 1), -GRAVITY)
-        scene = mpm.Scene(grid, law, gravity=gravity, **choices)
-        state = mpm.prepare(scene, mpm.Particles(x, v, b.mass * one, b.volume * one))
+        scene, state = prepared(b, law, **choices)
         given = scene, jnp.asarray(b.dt, b.dtype), state
         shapes = jax.tree.map(
             lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=place) if eqx.is_array(a) else a, given

@@ -72,6 +72,17 @@ def block(d: int, particles: int, nodes: int, per_cell: int, dtype: str) -> Bloc
     return Block(x, v, DENSITY * volume, volume, nodes, spacing, 0.3 * spacing / speed, dtype)
 
 
+def prepared(
+    b: Block, law: Any = mpm.NeoHookean(E_MODULUS, NU), wider: tuple[int, ...] = (1, 1, 1), **choices: Any
+) -> tuple[mpm.Scene, mpm.Particles]:
+    """The block in this package, in a window so many times as wide along each axis."""
+    d, one = b.x.shape[1], jnp.ones(len(b.x), b.dtype)
+    grid = mpm.Grid(tuple(b.nodes * times for times in wider[:d]), b.spacing)
+    scene = mpm.Scene(grid, law, **{"gravity": (*[0.0] * (d - 1), -GRAVITY)} | choices)
+    x, v = jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype)
+    return scene, mpm.prepare(scene, mpm.Particles(x, v, b.mass * one, b.volume * one))
+
+
 @contextmanager
 def summed_by(backend: str | None) -> Iterator[None]:
     """Programs that are compiled within take this back end, and keep it. None: that of the environment."""
@@ -100,13 +111,7 @@ class Ours:
         backend: str | None = None,
         wider: tuple[int, ...] = (1, 1, 1),
     ):
-        d, one = b.x.shape[1], jnp.ones(len(b.x), b.dtype)
-        particles = mpm.Particles(jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype), b.mass * one, b.volume * one)
-        gravity = (*[0.0] * (d - 1), -GRAVITY)
-        choices = {"gravity": gravity, "description": description, "gradient": mpm.MLSGradient()}
-        grid = mpm.Grid(tuple(b.nodes * times for times in wider[:d]), b.spacing)
-        scene = mpm.Scene(grid, mpm.NeoHookean(E_MODULUS, NU), **choices)
-        self._state = mpm.prepare(scene, particles)
+        scene, self._state = prepared(b, wider=wider, description=description, gradient=mpm.MLSGradient())
         self._given = scene, jnp.asarray(b.dt, b.dtype)
         go_on = jax.jit(lambda scene, dt, state: mpm.rollout(scene, state, steps=steps, dt=dt, method=method))
         with summed_by(backend):
