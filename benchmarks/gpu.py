@@ -23,6 +23,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+# Loops are then part of CUDA graphs. Read when JAX starts; what is set already stays.
+os.environ.setdefault("XLA_FLAGS", "--xla_gpu_enable_command_buffer=+WHILE,+CONDITIONAL")
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -8,8 +8,9 @@ memory.
 
 Loops are counted in the order in which they end, those within others first: a step, or an iteration of a solve and its
 restarts, or a step and its way back. A turn is the kernels that XLA makes of its fusions and copies, the condition, and
-for each call of this package's kernels what native/launches.h launches. Nothing runs: how long a launch takes is not
-told, nor that results are right (`gpu.py`, on a card).
+for each call of this package's kernels what native/launches.h launches. XLA is asked, as in gpu.py, to make CUDA graphs
+of loops too: of a program that is one, with all of its loops, this is said, and the host launches it once. Nothing runs:
+how long a launch takes is not told, nor that results are right (gpu.py, on a card).
 """
 
 import argparse
@@ -17,6 +18,8 @@ import ctypes
 import os
 import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 os.environ["JAX_PLATFORMS"] = "cpu"  # the plugin for cards is loaded, and looks for no driver
@@ -40,6 +43,7 @@ gpu_device_info {
   block_dim_limit_y: 65535 block_dim_limit_z: 65535 memory_bandwidth: 4800000000000 l2_cache_size: 62914560
   clock_rate_ghz: 1.98 device_memory_size: 150000000000 shared_memory_per_block_optin: 232448
   cuda_compute_capability { major: 9 } registers_per_core_limit: 65536 registers_per_block_limit: 65536
+  driver_version: "12.9.0"
 }
 platform_name: "CUDA" dnn_version_info { major: 9 minor: 8 } runtime_version { major: 12 minor: 9 }
 device_description_str: "NVIDIA H200"
@@ -72,6 +76,12 @@ def loops(program: str) -> list[int]:
             calls = re.findall(r" custom-call\(.*target=\"mpmjax_(\w+)\"", found[body])
             turns.append(1 + len(kernels) + sum(CALLS[name] for name in calls))
     return turns
+
+
+def is_one_graph(folder: str) -> bool:
+    """Whether a program that was compiled is one graph: what the host goes through is listed without an indent."""
+    (path,) = Path(folder).glob("*thunk_sequence_after_thunk_passes.txt")
+    return re.findall(r"^\d+: (\w+)", path.read_text(), re.MULTILINE) == ["kCommandBuffer"]
 
 
 Program = tuple[str, Block, Any, dict[str, Any], Callable[..., Any]]
@@ -131,12 +141,14 @@ def main() -> None:
         told = []
         for kind in ("cuda",) if options.cases else ("cuda", "xla"):
             jax.clear_caches()
-            with summed_by(kind):
-                program = jax.jit(function).trace(*shapes).lower(lowering_platforms=("cuda",)).compile()
+            with summed_by(kind), TemporaryDirectory() as folder:
+                lowered = jax.jit(function).trace(*shapes).lower(lowering_platforms=("cuda",))
+                program = lowered.compile({"xla_dump_to": folder})
+                graph = ", one graph" if is_one_graph(folder) else ""
             said = program.memory_analysis()
             memory = said.argument_size_in_bytes + said.output_size_in_bytes + said.temp_size_in_bytes
             turns = ", ".join(map(str, loops(program.as_text())))
-            told.append(f"{kind}: {turns} launches, {memory / 1e6:.0f} MB")
+            told.append(f"{kind}: {turns} launches, {memory / 1e6:.0f} MB{graph}")
         print(f"{name:<35} {'; '.join(told)}", flush=True)
 
 

@@ -1,8 +1,7 @@
 // The sums on NVIDIA's cards, without CUDA's headers and compiler: this is built by a C++ compiler alone, and carries the
 // text of its kernels. The driver and NVRTC, which JAX brings, are loaded at run time; a kernel is compiled for a basis,
 // a type and a card when it is first called, and kept on disk for later processes. Launches are put on XLA's stream and
-// can be captured in a graph: they allocate nothing and wait for nothing. A graph is captured after a first run without
-// one, in which kernels are compiled.
+// can be captured in a graph: they allocate nothing and wait for nothing.
 
 #include <dlfcn.h>
 
@@ -34,6 +33,7 @@ namespace {
 // Names of the libraries' types and values.
 using Handle = void*;  // a context, stream, module, function or program
 constexpr int kMajor = 75, kMinor = 76;  // attributes of a device: its compute capability
+constexpr int kRelaxed = 2;              // a mode of capturing streams
 constexpr int kThreads = 128;            // of a block
 constexpr int64_t kMostMembers = 65535;  // blocks along the second axis of a launch
 
@@ -84,6 +84,7 @@ struct Driver : Loaded {
   int (*retain)(Handle*, int) = find("cuDevicePrimaryCtxRetain");
   int (*push)(Handle) = find("cuCtxPushCurrent_v2");
   int (*pop)(Handle*) = find("cuCtxPopCurrent_v2");
+  int (*exchange_capture_mode)(int*) = find("cuThreadExchangeStreamCaptureMode");
   int (*context_of)(Handle, Handle*) = find("cuStreamGetCtx");
   int (*current_device)(int*) = find("cuCtxGetDevice");
   int (*attribute)(int*, int, int) = find("cuDeviceGetAttribute");
@@ -203,20 +204,37 @@ Handle function_of(Handle context, const std::string& text, std::string& fault) 
   return place->second;
 }
 
-// XLA's stream, whose context is current as long as this lives.
+// A context that is current as long as this lives. XLA captures a first call already, and kernels may be loaded while a
+// stream is captured in the relaxed mode alone.
+struct Entered {
+  std::string fault;
+
+  explicit Entered(Handle context) : fault(driver().fault(driver().push(context), "entering a context")) {
+    is_entered = fault.empty();
+    driver().exchange_capture_mode(&mode);
+  }
+  Entered(const Entered&) = delete;
+  ~Entered() {
+    driver().exchange_capture_mode(&mode);
+    if (Handle left; is_entered) driver().pop(&left);
+  }
+
+ private:
+  bool is_entered;
+  int mode = kRelaxed;  // and then the mode before
+};
+
+// XLA's stream, in its context.
 struct Stream {
   Handle handle, context = nullptr;
   mutable std::string fault;
+  Entered entered;
 
-  explicit Stream(Handle stream) : handle(stream) {
-    fault = driver().fault(driver().context_of(handle, &context), "finding the context of a stream");
-    if (fault.empty()) fault = driver().fault(driver().push(context), "entering the context of a stream");
-    if (!fault.empty()) context = nullptr;
-  }
-  Stream(const Stream&) = delete;
-  ~Stream() {
-    Handle left = nullptr;
-    if (context != nullptr) driver().pop(&left);
+  explicit Stream(Handle stream)
+      : handle(stream),
+        fault(driver().fault(driver().context_of(handle, &context), "finding the context of a stream")),
+        entered(context) {
+    if (fault.empty()) fault = entered.fault;
   }
 
   template <class T>
@@ -275,10 +293,9 @@ std::string start(const char* nvrtc, const char* cache) {
   driver().get_device(&device, 0);
   fault = driver().fault(driver().retain(&context, device), "the first card");
   if (!fault.empty()) return fault;
-  driver().push(context);
-  function_of(context, text_of("Scatter<float>", "1, 3, 1", 3), fault);
-  driver().pop(&context);
-  return fault;
+  const Entered entered(context);
+  if (entered.fault.empty()) function_of(context, text_of("Scatter<float>", "1, 3, 1", 3), fault);
+  return entered.fault + fault;
 }
 
 }  // namespace
