@@ -55,7 +55,8 @@ struct GivenValues {
   Simd<T> at[d + 1][columns] = {};
   int used;
 
-  MPMJAX_INLINE GivenValues(const ParticleLanes<T>& lanes, const Pull<T>& task, int64_t column, int used) : used(used) {
+  MPMJAX_INLINE GivenValues(const ParticleLanes<T>& lanes, const Pull<T>& task, int64_t column, int used)
+      : used(used) {
     const auto& values = task.values;
     by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
       for (int c = 0; c < used; ++c) {
@@ -220,11 +221,12 @@ struct Nodes {
   MPMJAX_INLINE Simd<T> at(const T* numbers) const { return load_as<Simd<T>>(numbers + q); }
 };
 
-// Stores the columns that are used of a gather, or adds them to what is there.
+// Stores the columns that are used of a gather, or adds them to what is there. Only what is common is stored in place:
+// all would take as long to compile as the sums.
 template <int d, class T, class Sums>
 MPMJAX_INLINE void put(const ParticleLanes<T>& lanes, const Sums& sums, int64_t column, int used, int64_t rows,
                        T* value, T* gradients, bool add = false) {
-  by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA {
+  const auto put_lanes = [=](auto all, const Sums& sums, bool add) MPMJAX_INLINE_LAMBDA {
     const auto store = [&](T* to, int64_t row, Simd<T> v) MPMJAX_INLINE_LAMBDA {
       lanes.template store<all>(to, row, add ? v + lanes.template load<all>(to, row) : v);
     };
@@ -232,7 +234,13 @@ MPMJAX_INLINE void put(const ParticleLanes<T>& lanes, const Sums& sums, int64_t 
       store(value, column + c, sums.value[c]);
       for (int b = 0; b < d; ++b) store(gradients, b * rows + column + c, sums.gradients[b][c]);
     }
-  });
+  };
+  const auto put_rarely = [=](const Sums& sums) MPMJAX_NOINLINE {
+    by_lanes(lanes, [&](auto all) MPMJAX_INLINE_LAMBDA { put_lanes(all, sums, add); });
+  };
+  if (lanes.whole() && !add) return put_lanes(std::true_type(), sums, false);
+  const Sums apart = sums;  // so that they need no place in memory
+  put_rarely(apart);
 }
 
 template <class T, int d, int s, int columns>
@@ -312,16 +320,20 @@ void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
 
 template <class T, int d, int s>
 void gather(const Gather<T>& task, int64_t first, int64_t last) {
-  if (task.columns == 1) return gather_columns<T, d, s, 1>(task, first, last);
-  if (task.columns == d) return gather_columns<T, d, s, d>(task, first, last);
-  if (task.columns == d + 1) return gather_columns<T, d, s, d + 1>(task, first, last);
+  if constexpr (d > 1) {
+    if (task.columns == 1) return gather_columns<T, d, s, 1>(task, first, last);
+    if (task.columns == d) return gather_columns<T, d, s, d>(task, first, last);
+    if (task.columns == d + 1) return gather_columns<T, d, s, d + 1>(task, first, last);
+  }
   gather_columns<T, d, s, 0>(task, first, last);
 }
 
 template <class T, int d, int s>
 void pull(const Pull<T>& task, int64_t first, int64_t last) {
-  if (task.columns == d) return pull_columns<T, d, s, d>(task, first, last);
-  if (task.columns == d + 1) return pull_columns<T, d, s, d + 1>(task, first, last);
+  if constexpr (d > 1) {
+    if (task.columns == d) return pull_columns<T, d, s, d>(task, first, last);
+    if (task.columns == d + 1) return pull_columns<T, d, s, d + 1>(task, first, last);
+  }
   pull_columns<T, d, s, 0>(task, first, last);
 }
 

@@ -300,8 +300,10 @@ void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int6
 template <class T, int d, int s>
 void add_all(const Scatter<T>& task, int64_t first, int64_t last) {
   const bool graded = task.values.gradients != nullptr;
-  if (graded && task.columns == d) return scatter_columns<T, d, s, true, d>(task, 0, first, last);
-  if (graded && task.columns == d + 1) return scatter_columns<T, d, s, true, d + 1>(task, 0, first, last);
+  if constexpr (d > 1) {
+    if (graded && task.columns == d) return scatter_columns<T, d, s, true, d>(task, 0, first, last);
+    if (graded && task.columns == d + 1) return scatter_columns<T, d, s, true, d + 1>(task, 0, first, last);
+  }
   for (int64_t c = 0; c < task.columns; c += kLanes) {
     graded ? scatter_columns<T, d, s, true, 0>(task, c, first, last)
            : scatter_columns<T, d, s, false, 0>(task, c, first, last);
