@@ -259,7 +259,7 @@ struct Resist {
 // A solve by the conjugate residual method: W⁻¹A x = W⁻¹b, with A = M + χH on free components and the identity on
 // others, and H the resistance of the particles. The recurrence begins at `start`, and again from the true residual
 // where it ends, until ‖r‖ is within its tolerance, has not halved, or steps are used up.
-constexpr int kTolerances = 3, kOutcome = 9, kVectors = 6;
+constexpr int kTolerances = 3, kOutcome = 9, kVectors = 5;
 
 template <class T>
 struct Solve {

@@ -80,15 +80,15 @@ std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, int64_t part
   return result;
 }
 
-// Runs the kernel of a problem on the nodes of all members.
-template <class Problem>
-void over_nodes(const Pool& pool, int64_t batch, const Problem& all, const Division& by) {
+// Runs the kernel of a problem on the nodes of all members, and then `next` on the nodes that it has set.
+template <class Problem, class Next>
+void over_nodes(const Pool& pool, int64_t batch, const Problem& all, const Division& by, const Next& next) {
   share(pool, batch * by.parts, [&](int64_t i) {
     const std::vector<int64_t>& cuts = by.cuts[i / by.parts];
     const int64_t first = cuts[i % by.parts], last = cuts[i % by.parts + 1];
     Problem task = member(all, i / by.parts);
     task.ranges = by.ranges.empty() ? nullptr : by.ranges.data() + i / by.parts * by.blocks;
-    if (first < last) kernel_of(all)(task, first, last);
+    if (first < last) kernel_of(all)(task, first, last), next(first, last);
   });
 }
 
@@ -129,7 +129,7 @@ void set_nodes(const Pool& pool, int64_t batch, Problem<T> all) {
   const bool large = all.size * all.columns * static_cast<int64_t>(sizeof(T)) > kCached;
   const std::unique_ptr<bool[]> reached(large ? new bool[batch * blocks_of(all.size)]() : nullptr);
   all.reached = reached.get();
-  over_nodes(pool, batch, all, divide(pool, batch, all, reached.get()));
+  over_nodes(pool, batch, all, divide(pool, batch, all, reached.get()), [](int64_t, int64_t) {});
 }
 
 template <class T>
@@ -145,19 +145,21 @@ void run(const Pool& pool, int64_t batch, const Average<T>& all) { set_nodes(poo
 template <class T>
 void run(const Pool& pool, int64_t batch, const P2G<T>& all) { set_nodes(pool, batch, all); }
 
-// A resistance with a division found before, which its particles' places alone decide.
-template <class T>
-void run(const Pool& pool, int64_t batch, Resist<T> all, const Division& division) {
-  if (reached(division) <= kMostReached) return over_nodes(pool, batch, all, division);
+// A resistance with a division found before, which its particles' places alone decide, and what is next for its nodes.
+template <class T, class Next>
+void run(const Pool& pool, int64_t batch, Resist<T> all, const Division& division, const Next& next) {
+  if (reached(division) <= kMostReached) return over_nodes(pool, batch, all, division, next);
   // Each particle once, and then a scatter: the parts would do most particles several times.
   const std::unique_ptr<T[]> stored(new T[batch * all.columns * all.columns * all.stencils.particles]);
   const ParticleValues<T> values = {nullptr, stored.get(), all.columns};
   const Scatter<T> rest = {all.stencils, values, all.nodes, nullptr, nullptr, all.size, all.columns, all.wanted};
   all.gradients = stored.get();
   over_particles(pool, batch, all);
-  over_nodes(pool, batch, rest, division);
+  over_nodes(pool, batch, rest, division, next);
 }
 template <class T>
-void run(const Pool& pool, int64_t batch, const Resist<T>& all) { run(pool, batch, all, divide(pool, batch, all)); }
+void run(const Pool& pool, int64_t batch, const Resist<T>& all) {
+  run(pool, batch, all, divide(pool, batch, all), [](int64_t, int64_t) {});
+}
 
 }  // namespace mpmjax

@@ -286,7 +286,7 @@ def solve_particle_matrices(
 def _call_solve(call: Any, xi: Array, *args: Array, basis: Basis) -> list[Array]:
     """By a kernel, with memory for six vectors. Members of a batch, one after the other in a thread, take their own."""
     n, dtype = args[-2].shape[-1], xi.dtype
-    results = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, 9, 0 if xi.ndim > 2 else 6 * n)]
+    results = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, 9, 0 if xi.ndim > 2 else 5 * n)]
     aliases = {1 + len(args) - 3: 0}
     return call([xi, *args], basis_attributes(basis), results=results, aliases=aliases)[:2]
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 
-INTERFACE = 18
+INTERFACE = 19
 """The version of the libraries' interface, as in native/CMakeLists.txt: both change with the handlers' arguments."""
 PATH = Path(__file__).parent / "lib" / "sums.so"
 """In a folder of its own: Python takes a shared library among modules for a module."""
