@@ -189,7 +189,7 @@ void check_solve(int d, int64_t particles, int64_t along, const Pools& pools) {
     for (int64_t i = 0; i < batch * size; ++i) {
       const bool active = task.active[i / size * blocks + i % size / kChunk];
       changed(task.free)[i] = active && task.free[i], changed(task.weight)[i] = some(random);
-      changed(task.start)[i] = active ? some(random) : 0, changed(task.rhs)[i] = task.free[i] ? some(random) : 0;
+      for (const T* vector : {task.start, task.rhs}) changed(vector)[i] = task.free[i] ? some(random) : 0;
     }
     for (int64_t m = 0; m < batch; ++m) {
       const T limits[] = {T(1e-2), T(m == 0 ? 0 : 40), T(1e-10)};

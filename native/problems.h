@@ -270,8 +270,8 @@ struct Solve {
   const bool* free;
   const T* weight;     // W
   const bool* active;  // for each block of kChunk components, as in a combination
-  const T* start;      // where x starts, which may lie where x does
-  const T* rhs;        // W⁻¹b; zero wherever nothing is active
+  const T* start;      // where x starts, which may lie where x does; zero wherever nothing is active or free
+  const T* rhs;        // W⁻¹b; likewise
   const T* limits;     // ‖r‖/‖W⁻¹b‖ to reach; most steps; part of ‖r‖² at a start that is the recurrence's floor
   T* x;
   // ‖r‖², steps, largest |rᵀA r|/‖r‖², whether rᵀA r vanished, whether it was negative, the change of x by the last

@@ -19,23 +19,22 @@ class OneThread : public Pool {
   void schedule(std::function<void()> task) const override { task(); }
 };
 
-// One solve. What is not active is never read, but of what the resistance moves. Rows that are not free are x = W W⁻¹b:
-// they are solved before the first step, and the residual is zero there.
+// One solve. What is not active is never read, but of what the resistance moves. Where rows are not free all vectors are
+// zero.
 template <class T>
 class Solver {
  public:
   Solver(const Pool& pool, const Solve<T>& task)
       : pool_(pool), task_(task), size_(task.nodes * task.stencils.basis.d),
         allocated_(task.room == 0 ? new T[kVectors * size_] : nullptr),
-        r_(task.room == 0 ? allocated_.get() : task.memory), last_(r_ + size_), p_(last_ + size_), q_(p_ + size_),
-        image_(q_ + size_), sums_(blocks_of(task.nodes)) {
+        r_(task.room == 0 ? allocated_.get() : task.memory), p_(r_ + size_), q_(p_ + size_), image_(q_ + size_),
+        last_(image_ + size_), sums_(blocks_of(task.nodes)) {
     resistance_.stencils = task.stencils, resistance_.matrices = task.matrices;
     resistance_.nodes = image_, resistance_.wanted = task.active;
     resistance_.size = task.nodes, resistance_.columns = task.stencils.basis.d;
     division_ = divide(pool, 1, resistance_);
     std::fill(r_, p_, T(0));
     if (task.x != task.start) std::copy(task.start, task.start + size_, task.x);
-    over_active([&](int64_t i) { task.x[i] = task.free[i] ? task.x[i] : task.rhs[i] * task.weight[i]; });
   }
 
   void run() {
@@ -44,10 +43,8 @@ class Solver {
     T before = std::numeric_limits<T>::infinity(), change = before;
     bool stalled = false;
     while (true) {
-      over_active([&](int64_t i) { last_[i] = task_.free[i] ? x[i] : T(0); });
-      apply(last_, x);
-      rr_ = square([&](int64_t i) { return task_.free[i] ? task_.rhs[i] - image_[i] : T(0); },
-                   [&](int64_t i, T v) { r_[i] = v; });
+      apply(x);
+      rr_ = square([&](int64_t i) { return task_.rhs[i] - image_[i]; }, [&](int64_t i, T v) { r_[i] = v; });
       stalled = rr_ > before / 4, before = rr_;
       if (stalled || vanished_ || !(std::sqrt(rr_) > tolerance) || !(steps_ < most)) break;
       over_active([&](int64_t i) { last_[i] = x[i]; });
@@ -67,7 +64,7 @@ class Solver {
     const T eps = std::numeric_limits<T>::epsilon();
     T qq = 0, radius = 0, before = std::numeric_limits<T>::infinity();
     while (std::sqrt(rr_) > tolerance && rr_ > floor && steps_ < most && !vanished_) {
-      const T gamma = apply(r, r), beta = gamma / before, onward[] = {beta, beta};
+      const T gamma = apply(r), beta = gamma / before, onward[] = {beta, beta};
       const T square = combine_with(r, p, image_, q, onward, p, q);
       const T rounding = eps * std::sqrt(rr_ * (square + beta * beta * qq));  // of γ: ε‖r‖‖s‖
       vanished_ = std::abs(gamma) <= rounding;
@@ -81,13 +78,12 @@ class Solver {
     radius_ = std::max(radius_, radius);
   }
 
-  // W⁻¹A v into the image, for a v of which `moved` has what is free, and zeros; returns vᵀA v. A thread goes on with the
-  // nodes whose resistance it has summed.
-  T apply(const T* moved, const T* v) {
+  // W⁻¹A v into the image; returns vᵀA v. A thread goes on with the nodes whose resistance it has summed.
+  T apply(const T* v) {
     const Product<T> rest = {image_, v, task_.mass, task_.factor, task_.free, task_.weight, task_.active, image_,
                              nullptr, size_, task_.nodes, false};
     const int64_t d = task_.stencils.basis.d, blocks = blocks_of(size_);
-    resistance_.moved = moved;
+    resistance_.moved = v;
     mpmjax::run(pool_, 1, resistance_, division_, [&](int64_t first, int64_t last) {
       for (int64_t k = first / kChunk; k < blocks_of(last); ++k) {
         sums_[k] = kernels<T>().product(rest, k * d, std::min((k + 1) * d, blocks));
@@ -132,7 +128,7 @@ class Solver {
   const Solve<T>& task_;
   const int64_t size_;
   const std::unique_ptr<T[]> allocated_;
-  T *const r_, *const last_, *const p_, *const q_, *const image_;
+  T *const r_, *const p_, *const q_, *const image_, *const last_;
   std::vector<double> sums_;  // of vᵀA v, for each block of kChunk nodes
   Resist<T> resistance_ = {};
   Division division_;

@@ -265,7 +265,8 @@ def _outcome(end: Iterate, rtol: Scalar, max_steps: int) -> tuple[lx.RESULTS, di
 def solve_particle_matrices(
     operator: ImplicitOperator, weight: Array, active: Array, b: Array, x: Array, rtol: Scalar, max_steps: Scalar
 ) -> Iterate:
-    """`conjugate_residual` with an operator that `is_particle_matrices` and a diagonal W, as a primitive.
+    """`conjugate_residual` with an operator that `is_particle_matrices` and a diagonal W, as a primitive. Rows that are
+    not free are solved apart, so that no iteration needs to mask what moves.
 
     On CPUs the native library runs it as a whole, and in a batch each member by itself. A loop of JAX goes on for all
     members until the last one is done, and selects whole vectors in every step.
@@ -276,15 +277,17 @@ def solve_particle_matrices(
     assert isinstance(hessian, ParticleStiffness)
     stencil = hessian.stencil
     factor = jnp.asarray(operator.factor * stencil.slope**2, b.dtype)
-    args = without_flat(stencil, hessian.upper), operator.mass, factor, free, weight, active, x, b, limits
+    start, rhs = jnp.where(free, x, 0), jnp.where(free, b, 0)
+    args = without_flat(stencil, hessian.upper), operator.mass, factor, free, weight, active, start, rhs, limits
     x, numbers = _solve(stencil.xi, *args, basis=stencil.basis)
+    x = jnp.where(free, x, weight * b)
     rr, k, radius, breakdown, indefinite, correction, stalled, b_norm, x_norm = numbers
     flags = breakdown > 0, indefinite > 0
     return Iterate(x, rr, k.astype(jnp.int32), radius, *flags, correction, stalled > 0, b_norm, x_norm)
 
 
 def _call_solve(call: Any, xi: Array, *args: Array, basis: Basis) -> list[Array]:
-    """By a kernel, with memory for six vectors. Members of a batch, one after the other in a thread, take their own."""
+    """By a kernel, with memory for five vectors. Members of a batch, one after the other in a thread, take their own."""
     n, dtype = args[-2].shape[-1], xi.dtype
     results = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, 9, 0 if xi.ndim > 2 else 5 * n)]
     aliases = {1 + len(args) - 3: 0}
@@ -298,12 +301,12 @@ def _call_solve(call: Any, xi: Array, *args: Array, basis: Basis) -> list[Array]
     call=_call_solve,
 )
 def _solve(xi: Array, *args: Array, basis: Basis) -> tuple[Array, Array]:
-    """`solve_particle_matrices`, written in JAX. Solves are not differentiated through their iterations."""
+    """`solve_particle_matrices` of vectors that are zero where they are not free, written in JAX. Solves are not
+    differentiated through their iterations."""
     upper, mass, factor, free, weight, active, x, b, limits = args
 
     def product(u: Array) -> tuple[Array, Array]:
-        moved = jnp.where(free, u, 0).reshape(len(mass), -1)
-        force = resist_sum(xi, upper, moved, basis=basis).reshape(-1)
+        force = resist_sum(xi, upper, u.reshape(len(mass), -1), basis=basis).reshape(-1)
         return rest_of_product(force, u, mass, factor, free, weight, active)
 
     end = conjugate_residual(diagonal(product, weight, active), b, x, limits[0], limits[1])
