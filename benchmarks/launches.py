@@ -9,8 +9,8 @@ memory.
 Loops are counted in the order in which they end, those within others first: a step, or an iteration of a solve and its
 restarts, or a step and its way back. A turn is the kernels that XLA makes of its fusions and copies, the condition, and
 for each call of this package's kernels what native/launches.h launches. XLA is asked, as in gpu.py, to make CUDA graphs
-of loops too: of a program that is one, with all of its loops, this is said; the host launches it once. Nothing runs: how
-long a launch takes is not told, nor that results are right (gpu.py, on a card).
+of loops too: of a program that is one, with all of its loops, this is said; the host launches it once. Nothing runs, so
+that neither times are told nor that results are right (gpu.py, on a card).
 """
 
 import argparse

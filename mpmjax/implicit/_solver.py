@@ -287,7 +287,7 @@ def solve_particle_matrices(
 
 
 def _call_solve(call: Any, xi: Array, *args: Array, basis: Basis) -> list[Array]:
-    """By a kernel, with memory for five vectors. Members of a batch, one after the other in a thread, take their own."""
+    """By a kernel, with memory for five vectors. Members of a batch, one by one in a thread, take their own."""
     n, dtype = args[-2].shape[-1], xi.dtype
     results = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, 9, 0 if xi.ndim > 2 else 5 * n)]
     aliases = {1 + len(args) - 3: 0}
