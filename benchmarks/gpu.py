@@ -193,6 +193,7 @@ def tests(quick: bool) -> Iterator[Row]:
     command = [sys.executable, "-m", "pytest", "-q", "-n", str(min(12, os.cpu_count() or 1))]
     # each worker would else take most of the card's memory, of which this process has a share already
     environment = os.environ | {"MPMJAX_BACKEND": kinds()[0], "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    environment.pop("XLA_FLAGS")  # as users run them
     done = subprocess.run(command, cwd=Path(__file__).parents[1], env=environment, capture_output=True, text=True)
     lines = done.stdout.splitlines()
     failed = [line for line in lines if line.startswith("FAILED")]

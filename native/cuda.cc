@@ -1,7 +1,7 @@
 // The sums on NVIDIA's cards, without CUDA's headers and compiler: this is built by a C++ compiler alone, and carries the
 // text of its kernels. The driver and NVRTC, which JAX brings, are loaded at run time; a kernel is compiled for a basis,
 // a type and a card when it is first called, and kept on disk for later processes. Launches are put on XLA's stream and
-// can be captured in a graph: they allocate nothing and wait for nothing.
+// can be captured in a graph: but for loading, at the first one, they allocate nothing and wait for nothing.
 
 #include <dlfcn.h>
 

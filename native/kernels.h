@@ -12,11 +12,11 @@ namespace mpmjax {
 template <class Problem>
 using Kernel = void (*)(const Problem&, int64_t first, int64_t last);
 
-// The sums for one dimension and kernel. Those of d and d + 1 columns, vectors at the nodes without and with a mass,
-// have code of their own, as has a gather of one; others, and those of one axis, are summed in four columns at a time.
-// Gather, pull and g2p take some particles. Others take all particles, and set some nodes; they pass over blocks whose
-// range of indices says that they give nothing to these. A resistance that is to store gradients does so for some
-// particles, and sets no node.
+// The sums for one dimension and kernel. In two and three, those of d and d + 1 columns, vectors at the nodes without and
+// with a mass, have code of their own, as has a gather of one; others are summed in four columns at a time. Gather, pull
+// and g2p take some particles. Others take all particles, and set some nodes; they pass over blocks whose range of
+// indices says that they give nothing to these. A resistance that is to store gradients does so for some particles, and
+// sets no node.
 template <class T>
 struct Kernels {
   std::tuple<Kernel<Gather<T>>, Kernel<Pull<T>>, Kernel<G2P<T>>, Kernel<Scatter<T>>, Kernel<Average<T>>, Kernel<P2G<T>>,

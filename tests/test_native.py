@@ -423,7 +423,7 @@ def test_solves_agree(choose, d):
     given = (
         jnp.asarray([3.0, 1e-4, 3.0, 1.0, 1.0, 1.0, 0.1]),
         jnp.asarray([500.0, 500, 500, 5, 0, 500, 500]),
-        jnp.stack([r] * 6 + [r / 0]),
+        jnp.stack([r] * 6 + [jnp.where(free, r, r / 0)]),
         jnp.asarray([1e-6, 1e-6, 1e-12, 1e-6, 1e-6, 1e-18, 1e-6]),
         jnp.asarray([0.0, 0, 1e9, 0, 1, 0, 0]),
     )
@@ -444,6 +444,7 @@ def test_solves_agree(choose, d):
     assert native.stalled[5]
     assert not native.stalled[:3].any()
     assert np.isfinite(native.x[:6]).all()
+    assert np.isnan([native.rr[6], xla.rr[6]]).all()
     assert (np.sqrt(native.rr) <= given[3] * native.b_norm)[:3].all()
     for name in ("x", "rr", "k", "radius", "breakdown", "indefinite", "b_norm", "x_norm"):
         ours, theirs = (np.asarray(getattr(one, name)) for one in (native, xla))

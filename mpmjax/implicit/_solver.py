@@ -280,9 +280,10 @@ def solve_particle_matrices(
     start, rhs = jnp.where(free, x, 0), jnp.where(free, b, 0)
     args = without_flat(stencil, hessian.upper), operator.mass, factor, free, weight, active, start, rhs, limits
     x, numbers = _solve(stencil.xi, *args, basis=stencil.basis)
-    x = jnp.where(free, x, weight * b)
     rr, k, radius, breakdown, indefinite, correction, stalled, b_norm, x_norm = numbers
     flags = breakdown > 0, indefinite > 0
+    held = jnp.where(free, 0, b)
+    x, rr = jnp.where(free, x, weight * b), rr + 0 * (weight * held * held).sum()  # NaN where a held row is not finite
     return Iterate(x, rr, k.astype(jnp.int32), radius, *flags, correction, stalled > 0, b_norm, x_norm)
 
 
