@@ -403,7 +403,7 @@ def test_products_of_vectors_agree(choose, each):
 def test_solves_agree(choose, d):
     """Native and by XLA, in a batch whose members end after other numbers of steps: at the tolerance, after restarts
     from a guess far off, at the most steps, at once, at the limit of the precision. Each is bit for bit what it is
-    alone, beside one that is not finite too."""
+    alone, beside one that is not finite where it is held; the third is the solution."""
     rng = np.random.default_rng(d)
     xi, upper, u = resistance(d, 30, "float64", wild=False, side=8)
     size = u.size
@@ -413,11 +413,13 @@ def test_solves_agree(choose, d):
     r, weight = jnp.asarray(rng.normal(size=size)), jnp.asarray(rng.uniform(1, 2, size))
     active = active_blocks(free)
 
-    def run(factor, steps, r, rtol, far):
+    def matrices(factor):
         stencil = Stencil(xi, jnp.asarray(1.0), xi[0] >= 0, basis_for(d, 3, side=8))
         stiffness = ParticleStiffness(upper, stencil, Mirror(()))
-        matrices = ImplicitOperator(mass, factor, stiffness, Projection(free.reshape(u.shape)))
-        return solver.solve_particle_matrices(matrices, weight, active, r, far * x, rtol, steps)
+        return ImplicitOperator(mass, factor, stiffness, Projection(free.reshape(u.shape)))
+
+    def run(factor, steps, r, rtol, far):
+        return solver.solve_particle_matrices(matrices(factor), weight, active, r, far * x, rtol, steps)
 
     x = jnp.asarray(rng.normal(size=size))  # neither is zero where nothing is free
     given = (
@@ -449,6 +451,10 @@ def test_solves_agree(choose, d):
     for name in ("x", "rr", "k", "radius", "breakdown", "indefinite", "b_norm", "x_norm"):
         ours, theirs = (np.asarray(getattr(one, name)) for one in (native, xla))
         assert_close(ours[[0, 1, 3, 4]], theirs[[0, 1, 3, 4]], rtol=1e-9)
+    solution = np.linalg.solve(matrices(given[0][2]).as_matrix(), weight * r)
+    assert_close(native.x[2], solution, rtol=1e-9)
+    left = r - matrices(given[0][4]).as_matrix() @ x / weight  # of the start; what is held is solved
+    assert_close(native.rr[4], (weight * left**2)[free].sum(), rtol=1e-9)
     for k in (2, 5):  # down to rounding the steps are not the same
         assert_close(native.x[k], xla.x[k], rtol=1e-9)
 
