@@ -80,7 +80,7 @@ std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, int64_t part
   return result;
 }
 
-// Runs the kernel of a problem on the nodes of all members, and then `next` on the nodes that it has set.
+// Runs the kernel of a problem on the nodes of all members, and then `next`, whoever the member, on those that it set.
 template <class Problem, class Next>
 void over_nodes(const Pool& pool, int64_t batch, const Problem& all, const Division& by, const Next& next) {
   share(pool, batch * by.parts, [&](int64_t i) {
